@@ -1,0 +1,193 @@
+"""A run: what one train recorded on one drive, as flat arrays on one clock.
+
+Streams are frozen values in SI and radians; an absent optional column is `None`, an absent single value is NaN. Times are
+seconds since `Run.start`, strictly increasing within a stream.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+#: Called on long work with the stage, how much is done and how much there is.
+Progress = Callable[[str, int, int], None]
+
+
+def _zeros3() -> FloatArray:
+    zeros = np.zeros(3)
+    zeros.flags.writeable = False
+    return zeros
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GnssStream:
+    """GNSS fixes.
+
+    Attributes
+    ----------
+    time : (m,) array
+        Seconds since the run's start, strictly increasing.
+    latitude, longitude : (m,) array
+        Geodetic coordinates of the antenna in `frame`, rad.
+    height : (m,) array or None
+        Ellipsoidal height of the antenna, m.
+    sigma_east, sigma_north, sigma_up : (m,) array or None
+        Standard deviations as the receiver states them, m; NaN where it says nothing.
+    speed, course, sigma_speed : (m,) array or None
+        Ground speed, m/s; course over ground from true north, rad; and sigma of the speed, m/s.
+    quality, satellites, hdop : (m,) array or None
+        The receiver's own words.
+    lever_arm_b : (3,) array
+        Reference point to antenna: forward, right, down, m.
+    frame : str
+        The frame of the coordinates, as run.toml names it.
+    receiver : str
+        Kind of receiver, where run.toml names it; otherwise empty.
+    """
+
+    time: FloatArray
+    latitude: FloatArray
+    longitude: FloatArray
+    height: FloatArray | None = None
+    sigma_east: FloatArray | None = None
+    sigma_north: FloatArray | None = None
+    sigma_up: FloatArray | None = None
+    speed: FloatArray | None = None
+    course: FloatArray | None = None
+    sigma_speed: FloatArray | None = None
+    quality: FloatArray | None = None
+    satellites: FloatArray | None = None
+    hdop: FloatArray | None = None
+    lever_arm_b: FloatArray = field(default_factory=_zeros3)
+    frame: str = "WGS84"
+    receiver: str = ""
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuStream:
+    """Inertial samples: each row is the mean over the interval that ends at its time.
+
+    Attributes
+    ----------
+    time : (m,) array
+        Seconds since the run's start, strictly increasing.
+    gyro, specific_force : (m, 3) array
+        Angular rate, rad/s, and specific force, m/s^2, in the IMU's own axes (forward, right, down when mounted straight).
+    lever_arm_b : (3,) array
+        Reference point to IMU: forward, right, down, m.
+    mounting : (3,) array
+        Roll, pitch, yaw that turn body axes into IMU axes, rad: v_imu = (Rz Ry Rx)^T v_b.
+    """
+
+    time: FloatArray
+    gyro: FloatArray
+    specific_force: FloatArray
+    lever_arm_b: FloatArray = field(default_factory=_zeros3)
+    mounting: FloatArray = field(default_factory=_zeros3)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OdometerStream:
+    """Odometer readings: cumulative distance or speed.
+
+    Attributes
+    ----------
+    time : (m,) array
+        Seconds since the run's start, strictly increasing.
+    distance : (m,) array or None
+        Cumulative distance, m; unsigned (backing up adds) unless `signed`.
+    speed : (m,) array or None
+        Speed, m/s.
+    sigma_speed : (m,) array or None
+        Standard deviation of the speed, m/s.
+    signed : bool
+        Whether backing up subtracts.
+    """
+
+    time: FloatArray
+    distance: FloatArray | None = None
+    speed: FloatArray | None = None
+    sigma_speed: FloatArray | None = None
+    signed: bool = False
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GyroAnglesStream:
+    """Attitude from a gyroscopic sensor: time, s; roll, pitch and heading from true north, rad; each (m,)."""
+
+    time: FloatArray
+    roll: FloatArray
+    pitch: FloatArray
+    heading: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GaugeStream:
+    """Gauge sensor: time, s; gauge and, where measured, cant, m; each (m,)."""
+
+    time: FloatArray
+    gauge: FloatArray
+    cant: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BaliseStream:
+    """Balise readings: time, s, (m,); identifiers; sigma along the track, m, (m,) or None."""
+
+    time: FloatArray
+    id: tuple[str, ...]
+    sigma: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Run:
+    """One drive: its streams, its clock and where it came from.
+
+    Attributes
+    ----------
+    id : str
+        The run's name.
+    start : datetime
+        UTC; every time in the streams counts from here.
+    direction : str
+        Direction of running as run.toml names it; empty when it does not. Separates the tracks of a double line.
+    gnss, imu, odometer, gyro_angles, gauge, balise : stream or None
+        The streams that exist.
+    source : path or None
+        The folder the run was read from.
+    """
+
+    id: str
+    start: datetime
+    direction: str = ""
+    gnss: GnssStream | None = None
+    imu: ImuStream | None = None
+    odometer: OdometerStream | None = None
+    gyro_angles: GyroAnglesStream | None = None
+    gauge: GaugeStream | None = None
+    balise: BaliseStream | None = None
+    source: Path | None = None
+
+    @classmethod
+    def read(cls, folder: str | Path) -> Self:
+        """Read a run folder (run.toml and the streams it names); see `railnav.io.run.read_run`."""
+        from railnav.io.run import read_run  # a door upward, named in the import contract
+
+        return read_run(folder)  # type: ignore[return-value]
