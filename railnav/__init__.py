@@ -87,7 +87,7 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:  # noqa: ANN401 - the names differ in type
+def __getattr__(name: str) -> Any:
     """Import a public name from its room on first use (PEP 562)."""
     if name not in _HOME:
         raise AttributeError(f"module 'railnav' has no attribute {name!r}")

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -186,8 +185,8 @@ class Run:
     source: Path | None = None
 
     @classmethod
-    def read(cls, folder: str | Path) -> Self:
+    def read(cls, folder: str | Path) -> Run:
         """Read a run folder (run.toml and the streams it names); see `railnav.io.run.read_run`."""
         from railnav.io.run import read_run  # a door upward, named in the import contract
 
-        return read_run(folder)  # type: ignore[return-value]
+        return read_run(folder)

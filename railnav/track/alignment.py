@@ -12,7 +12,6 @@ from railnav.errors import TrackError
 
 if TYPE_CHECKING:
     from railnav.geodesy.grid import GridFrame
-    from scipy.interpolate import PPoly
 
 FloatArray = NDArray[np.float64]
 
@@ -54,15 +53,6 @@ class KnotTable:
     cant: FloatArray
     scale: FloatArray
     covariance_g: FloatArray
-
-
-def _spline(parameter: FloatArray, values: FloatArray) -> PPoly:
-    """Interpolating C2 spline; falls to a parabola or a line with three or two points."""
-    from scipy.interpolate import CubicSpline, make_interp_spline
-
-    if len(parameter) >= 4:
-        return CubicSpline(parameter, values, bc_type="not-a-knot")
-    return make_interp_spline(parameter, values, k=len(parameter) - 1)
 
 
 def fit_alignment(
@@ -109,6 +99,8 @@ def fit_alignment(
     -----
     Vertices rounded to 0.1 mm every 5 m give a curvature good to about 1e-5 1/m.
     """
+    from scipy.interpolate import CubicSpline
+
     east, north = np.atleast_1d(np.asarray(easting, float)), np.atleast_1d(np.asarray(northing, float))
     n = len(east)
     up = np.full(n, np.nan) if height is None else np.asarray(height, float)
@@ -128,7 +120,8 @@ def fit_alignment(
     has_height = bool(np.isfinite(up).all())
 
     p = np.append(0.0, np.cumsum(np.hypot(np.diff(east), np.diff(north))))
-    spline = _spline(p, np.column_stack([east, north, up if has_height else np.zeros(len(p))]))
+    # not-a-knot ends; with three points a parabola, with two a straight line
+    spline = CubicSpline(p, np.column_stack([east, north, up if has_height else np.zeros(len(p))]))
     first, second = spline.derivative(1), spline.derivative(2)
 
     # point scale changes by less than 1e-10 over 100 m: tabulate it that finely and no finer
@@ -140,7 +133,7 @@ def fit_alignment(
         """Ground metres per metre of parameter."""
         d = first(parameter)
         horizontal = np.hypot(d[..., 0], d[..., 1]) / np.interp(parameter, q, scale_q)
-        return np.hypot(horizontal, d[..., 2])
+        return np.asarray(np.hypot(horizontal, d[..., 2]))
 
     # intervals of integration end at the vertices and are at most 5 m long
     pieces = np.maximum(1, np.ceil(np.diff(p) / 5.0).astype(int))

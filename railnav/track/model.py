@@ -11,13 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from railnav.geodesy.grid import GridFrame
 
 from railnav.errors import TrackError
+from railnav.geodesy.grid import GridFrame
 from railnav.track.index import SpatialIndex, index_tracks
 from railnav.units import wrap_angle
 
@@ -241,11 +241,11 @@ class TrackModel:
         object.__setattr__(self, "_index", index_tracks(self.knot_start, self.easting, self.northing))
 
     @classmethod
-    def read(cls, path: str | Path) -> Self:
+    def read(cls, path: str | Path) -> TrackModel:
         """Read a model from a GeoPackage; see `railnav.io.geopackage.read_model`."""
         from railnav.io.geopackage import read_model  # a door upward, named in the import contract
 
-        return read_model(path)  # type: ignore[return-value]
+        return read_model(path)
 
     def to_file(self, path: str | Path) -> None:
         """Write the model as a GeoPackage; see `railnav.io.geopackage.write_model`."""
