@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -116,13 +116,15 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 @contextmanager
-def atomic_folder(path: str | Path) -> Iterator[Path]:
+def atomic_folder(path: str | Path, *, replaceable: Collection[str] = ()) -> Iterator[Path]:
     """Lend a temporary folder that becomes `path` when the block ends well.
 
     Parameters
     ----------
     path : path
-        New folder. It must not exist, or be empty: files are never mixed into a folder that holds something.
+        Folder to write. It must not exist, be empty, or hold nothing but `replaceable` files.
+    replaceable : collection of str
+        Names of files that the same writer may have put there earlier; anything else in the folder is never touched.
 
     Yields
     ------
@@ -132,7 +134,12 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     Raises
     ------
     InputError
-        The parent does not exist or cannot be written, or `path` is there and not an empty folder.
+        The parent does not exist or cannot be written, or `path` is a file or a folder with other files in it.
+
+    Notes
+    -----
+    A new or empty folder appears in one step. A folder that is replaced is first renamed aside, since no system call in
+    reach swaps two folders: a process killed between these two renames leaves the old one whole as `.railnav-*.old`.
 
     Examples
     --------
@@ -144,9 +151,16 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     ['run.toml']
     """
     target = _resolve(path)
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise InputError("is already there", file=path, remedy="give a new folder, or remove this one first")
+    try:
+        held = sorted(file.name for file in target.iterdir()) if target.exists() else []
+    except OSError as error:
+        raise InputError("is no folder that can be replaced", file=path, remedy="give a new folder") from error
+    foreign = [name for name in held if name not in replaceable]
+    if foreign:
+        cause = f"the folder is not empty (it holds {foreign[0]})"
+        raise InputError(cause, file=path, remedy="give a new folder, or remove this one first")
     draft = _partial(target)
+    aside = draft.with_suffix(".old")
     try:
         draft.mkdir()
     except (OSError, ValueError) as error:
@@ -157,9 +171,19 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
             if file.is_file():
                 _sync(file)
         _sync_folder(draft)
-        draft.replace(target)
+        if held:
+            target.rename(aside)
+            try:
+                draft.rename(target)
+            except BaseException:
+                aside.rename(target)
+                raise
+        else:
+            draft.replace(target)
     except OSError as error:
         raise _cannot_write(path, error) from error
     finally:
         shutil.rmtree(draft, ignore_errors=True)
+        if target.exists():
+            shutil.rmtree(aside, ignore_errors=True)
     _sync_folder(target.parent)

@@ -1,0 +1,496 @@
+"""Run folders: `run.toml` and the streams it names, read into a Run and written from one.
+
+Units are turned into SI and radians here, and nowhere else. What a stream's columns mean stands in the table of formats in
+`docs/`; every refusal names the file, the row as an editor counts it, the column, and a way out.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import msgspec
+import numpy as np
+from msgspec import Meta, Struct
+from numpy.typing import NDArray
+
+from railnav.errors import RunError
+from railnav.io.atomic import atomic_folder
+from railnav.io.tables import Column, Table, Words, freeze, read_table, write_table
+from railnav.run import BaliseStream, GaugeStream, GnssStream, GyroAnglesStream, ImuStream, OdometerStream, Run
+
+if TYPE_CHECKING:
+    from railnav.truth import Truth
+
+FloatArray = NDArray[np.float64]
+
+#: The table of contents of a run folder.
+CONTENTS = "run.toml"
+#: Formats of streams that are read.
+FORMATS = ("csv", "parquet")
+#: A run.toml larger than this is refused.
+MAX_CONTENTS_BYTES = 1_000_000
+#: An unsigned odometer may fall by its noise, m, not by more.
+ODOMETER_NOISE = 0.1
+
+_Vector = tuple[float, float, float]
+
+
+class _Stream(Struct):
+    file: Annotated[str, Meta(min_length=1)]
+    format: str = "csv"
+    time_offset_s: Annotated[float, Meta(ge=-1e7, le=1e7)] = 0.0
+
+
+class _Gnss(_Stream):
+    frame: Annotated[str, Meta(min_length=1)] = "WGS84"
+    receiver: str = ""
+    lever_arm_m: _Vector = (0.0, 0.0, 0.0)
+
+
+class _Imu(_Stream):
+    lever_arm_m: _Vector = (0.0, 0.0, 0.0)
+    mounting_deg: _Vector = (0.0, 0.0, 0.0)
+
+
+class _Odometer(_Stream):
+    signed: bool = False
+
+
+class _Head(Struct):
+    id: Annotated[str, Meta(min_length=1)]
+    start: Any
+    direction: str = ""
+
+
+class _Contents(Struct):
+    run: _Head
+    gnss: _Gnss | None = None
+    imu: _Imu | None = None
+    odometer: _Odometer | None = None
+    gyro_angles: _Stream | None = None
+    gauge: _Stream | None = None
+    balise: _Stream | None = None
+
+
+STREAMS = ("gnss", "imu", "odometer", "gyro_angles", "gauge", "balise")
+
+
+def _optional(*names: str, positive: bool = False) -> tuple[Column, ...]:
+    return tuple(Column(name, required=False, complete=False, positive=positive) for name in names)
+
+
+_TIME = Column("time_s")
+_NO_FIX = "remove rows without a fix"
+_COLUMNS: dict[str, tuple[Column, ...]] = {
+    "gnss": (
+        _TIME,
+        Column("latitude_deg", low=-90, high=90, remedy=_NO_FIX),
+        Column("longitude_deg", low=-180, high=180, remedy=_NO_FIX),
+        *_optional("height_m", "speed_m_s", "course_deg", "quality", "satellites", "hdop"),
+        *_optional("sigma_east_m", "sigma_north_m", "sigma_up_m", "sigma_speed_m_s", positive=True),
+    ),
+    "imu": (
+        _TIME,
+        *(Column(f"gyro_{axis}_rad_s") for axis in "xyz"),
+        *(Column(f"accel_{axis}_m_s2") for axis in "xyz"),
+    ),
+    "odometer": (_TIME, *_optional("distance_m", "speed_m_s"), *_optional("sigma_speed_m_s", positive=True)),
+    "gyro_angles": (_TIME, Column("roll_deg"), Column("pitch_deg"), Column("heading_deg")),
+    "gauge": (_TIME, Column("gauge_mm", low=100, high=5000), *_optional("cant_mm")),
+    "balise": (_TIME, Column("id", text=True), *_optional("sigma_m", positive=True)),
+}
+
+
+def read_run(folder: str | Path) -> Run:
+    r"""Read a run folder: `run.toml` and the streams it names.
+
+    Parameters
+    ----------
+    folder : path
+        Folder of one drive. Streams are CSV or Parquet, by the ending of their file.
+
+    Returns
+    -------
+    Run
+        Streams in SI and radians, `time_offset_s` added; arrays are read-only. A column that is absent, or empty
+        throughout, is None; an empty cell is NaN.
+
+    Raises
+    ------
+    RunError
+        run.toml or a stream is missing, malformed or empty; a required column is missing; a value is not finite where one
+        is needed or outside its lawful range; sigma is not positive; time stands still or runs backwards; a file lies
+        outside the folder; a format is not read yet.
+
+    Notes
+    -----
+    GNSS coordinates stay in the frame that run.toml names; `GnssStream.frame` carries the name. An unsigned odometer that
+    falls by more than 0.1 m is refused.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = Path(folder, "run.toml").write_text(
+    ...         '[run]\nid = "a"\nstart = "2026-05-04T08:00:00Z"\n[odometer]\nfile = "odometer.csv"\n')
+    ...     _ = Path(folder, "odometer.csv").write_text("time_s,speed_m_s\n0.0,10.0\n0.1,10.2\n")
+    ...     read_run(folder).odometer.speed.tolist()
+    [10.0, 10.2]
+    """
+    folder = Path(folder)
+    contents = _read_contents(folder)
+    file = folder / CONTENTS
+    tables: dict[str, Table] = {}
+    for name in STREAMS:
+        stream: _Stream | None = getattr(contents, name)
+        if stream is not None:
+            tables[name] = read_table(_stream_file(folder, name, stream), _COLUMNS[name], error=RunError)
+    if not tables:
+        cause = f"names no stream; a stream is one of {', '.join(STREAMS)}"
+        raise RunError(cause, file=file, remedy='add for instance [gnss] with file = "gnss.csv"')
+    time = {name: _time(table, getattr(contents, name).time_offset_s) for name, table in tables.items()}
+    return Run(
+        id=contents.run.id,
+        start=_start(contents.run.start, file),
+        direction=contents.run.direction,
+        gnss=_gnss(tables["gnss"], time["gnss"], contents.gnss) if contents.gnss else None,
+        imu=_imu(tables["imu"], time["imu"], contents.imu) if contents.imu else None,
+        odometer=_odometer(tables["odometer"], time["odometer"], contents.odometer) if contents.odometer else None,
+        gyro_angles=_gyro_angles(tables["gyro_angles"], time["gyro_angles"]) if contents.gyro_angles else None,
+        gauge=_gauge(tables["gauge"], time["gauge"]) if contents.gauge else None,
+        balise=_balise(tables["balise"], time["balise"]) if contents.balise else None,
+        source=folder,
+    )
+
+
+def write_run(run: Run, folder: str | Path, *, truth: Truth | None = None) -> None:
+    """Write a run folder: `run.toml`, one CSV file a stream, and `truth.csv` where there is truth.
+
+    Parameters
+    ----------
+    run : Run
+        What to write; times must grow strictly within each stream.
+    folder : path
+        New or empty folder, or one that an earlier call wrote and that holds nothing else; replaced as a whole.
+    truth : Truth, optional
+        Written beside the streams in the format of `railnav.io.truth`.
+
+    Raises
+    ------
+    RunError
+        The run has no stream, or a stream has no rows.
+    InputError
+        The folder cannot be written, or holds other files.
+
+    Notes
+    -----
+    Numbers are rounded to 1e-6 s, 1e-10 degrees (0.01 mm), 1e-5 m, 1e-10 rad/s and 1e-8 m/s2: the bytes depend on the run
+    alone, and writing again what was read gives the same bytes.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> run = Run("a", datetime(2026, 5, 4, 8, tzinfo=UTC), odometer=OdometerStream(np.arange(3.0), speed=np.ones(3)))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_run(run, f"{folder}/a")
+    ...     len(read_run(f"{folder}/a").odometer)
+    3
+    """
+    from railnav.io.truth import write_truth
+
+    streams = {name: columns for name in STREAMS if (columns := _stream_columns(run, name))}
+    if not streams:
+        raise RunError("the run has no stream to write", file=folder)
+    for name in streams:
+        if not len(getattr(run, name).time):
+            raise RunError(f"the {name} stream has no rows", file=folder, remedy="leave the stream out")
+    written = [CONTENTS, "truth.csv", *(f"{name}.csv" for name in STREAMS)]
+    with atomic_folder(folder, replaceable=written) as draft:
+        (draft / CONTENTS).write_text(_contents_text(run), encoding="utf-8", newline="\n")
+        for name, columns in streams.items():
+            write_table(draft / f"{name}.csv", columns, decimals=_DECIMALS)
+        if truth is not None:
+            write_truth(truth, draft / "truth.csv")
+
+
+# --- run.toml ---------------------------------------------------------------------------------------------------------
+
+
+def _read_contents(folder: Path) -> _Contents:
+    file = folder / CONTENTS
+    if not folder.is_dir():
+        cause = "is no run folder" if folder.exists() else "does not exist"
+        raise RunError(cause, file=folder, remedy=f"a run is a folder that holds {CONTENTS}")
+    if not file.is_file():
+        raise RunError(f"the folder holds no {CONTENTS}", file=folder, remedy="name a run folder, or write one")
+    try:
+        if file.stat().st_size > MAX_CONTENTS_BYTES:
+            raise RunError("is larger than 1 MB", file=file, remedy="it only names the streams")
+        values = tomllib.loads(file.read_bytes().removeprefix(b"\xef\xbb\xbf").decode())
+    except UnicodeDecodeError as error:
+        raise RunError("is not UTF-8 text", file=file, remedy="save it as UTF-8") from error
+    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
+        raise RunError(f"is no TOML ({_one_line(error)})", file=file, remedy="text stands in double quotes") from error
+    except OSError as error:
+        raise RunError(f"cannot be read ({error.strerror or error})", file=file) from error
+    if not isinstance(values.get("run"), dict):
+        raise RunError("the table [run] is missing", file=file, remedy="add [run] with id and start")
+    for key in ("id", "start"):
+        if key not in values["run"]:
+            example = "2021-06-29T10:35:17Z" if key == "start" else folder.resolve().name
+            raise RunError("is missing", file=file, column=f"run.{key}", remedy=f'add {key} = "{example}"')
+    try:
+        contents = msgspec.convert(values, _Contents)
+    except msgspec.ValidationError as error:
+        cause, _, where = str(error).partition(" - at `$.")
+        raise RunError(_one_line(cause), file=file, column=where.rstrip("`") or None) from error
+    for name in STREAMS:
+        for key in ("lever_arm_m", "mounting_deg", "time_offset_s"):
+            value = getattr(getattr(contents, name), key, None)
+            if value is not None and not np.isfinite(value).all():
+                raise RunError("is not finite", file=file, column=f"{name}.{key}")
+    return contents
+
+
+def _one_line(error: object) -> str:
+    text = " ".join(str(error).split())
+    return text[:1].lower() + text[1:200]
+
+
+def _start(start: object, file: Path) -> datetime:
+    example = 'write UTC, as in start = "2021-06-29T10:35:17Z"'
+    try:
+        value = start if isinstance(start, datetime) else datetime.fromisoformat(str(start).strip())
+    except ValueError as error:
+        raise RunError(f"{str(start)[:40]!r} is no instant", file=file, column="run.start", remedy=example) from error
+    if value.utcoffset() is None:
+        cause = f"'{value.isoformat()}' has no time zone"
+        raise RunError(cause, file=file, column="run.start", remedy=example)
+    try:
+        return value.astimezone(UTC)
+    except OverflowError as error:
+        raise RunError(f"{value} is no instant", file=file, column="run.start", remedy=example) from error
+
+
+def _stream_file(folder: Path, name: str, stream: _Stream) -> Path:
+    contents, column = folder / CONTENTS, f"{name}.file"
+    if stream.format not in FORMATS:
+        cause = f"{stream.format[:40]!r} is a format that is not read yet; csv and parquet are"
+        remedy = "convert the stream to CSV with the columns of formats.md"
+        raise RunError(cause, file=contents, column=f"{name}.format", remedy=remedy)
+    path = Path(stream.file)
+    try:
+        inside = (folder / path).resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError, RuntimeError) as error:
+        raise RunError(f"{stream.file[:80]!r} is no usable path", file=contents, column=column) from error
+    if path.is_absolute() or not inside:
+        cause = f"{stream.file[:80]!r} lies outside the run folder"
+        raise RunError(cause, file=contents, column=column, remedy="put the file into the folder")
+    return folder / path
+
+
+def _quoted(text: str) -> str:
+    escaped = "".join(
+        f"\\u{ord(c):04x}" if ord(c) < 0x20 or ord(c) == 0x7F else f"\\{c}" if c in '"\\' else c for c in text
+    )
+    return f'"{escaped}"'
+
+
+def _vector(values: FloatArray, decimals: int) -> str:
+    return f"[{', '.join(repr(float(value)) for value in np.round(values, decimals) + 0.0)}]"
+
+
+def _contents_text(run: Run) -> str:
+    start = run.start.astimezone(UTC).isoformat().replace("+00:00", "Z")
+    lines = ["[run]", f"id = {_quoted(run.id)}", f"start = {_quoted(start)}"]
+    if run.direction:
+        lines.append(f"direction = {_quoted(run.direction)}")
+    for name in STREAMS:
+        stream = getattr(run, name)
+        if stream is None:
+            continue
+        lines += ["", f"[{name}]", f'file = "{name}.csv"', 'format = "csv"']
+        if isinstance(stream, GnssStream):
+            lines.append(f"frame = {_quoted(stream.frame)}")
+            if stream.receiver:
+                lines.append(f"receiver = {_quoted(stream.receiver)}")
+        if isinstance(stream, GnssStream | ImuStream):
+            lines.append(f"lever_arm_m = {_vector(stream.lever_arm_b, 6)}")
+        if isinstance(stream, ImuStream):
+            lines.append(f"mounting_deg = {_vector(np.rad2deg(stream.mounting), 8)}")
+        if isinstance(stream, OdometerStream) and stream.signed:
+            lines.append("signed = true")
+    return "\n".join(lines) + "\n"
+
+
+# --- streams ----------------------------------------------------------------------------------------------------------
+
+
+def _time(table: Table, offset: float) -> FloatArray:
+    stamps = table.increasing("time_s")
+    if offset == 0.0:
+        return stamps
+    shifted = freeze(stamps + offset)
+    return replace(table, number={"time_s": shifted}).increasing("time_s")  # stamps so close that the sum merges them
+
+
+def _known(table: Table, name: str) -> FloatArray | None:
+    values = table.number.get(name)
+    return None if values is None or np.isnan(values).all() else values
+
+
+def _angle(table: Table, name: str) -> FloatArray | None:
+    values = _known(table, name)
+    return None if values is None else freeze(np.deg2rad(values))
+
+
+def _fixed(values: Sequence[float]) -> FloatArray:
+    return freeze(np.array(values, dtype=np.float64))
+
+
+def _gnss(table: Table, time: FloatArray, stream: _Gnss) -> GnssStream:
+    return GnssStream(
+        time=time,
+        latitude=freeze(np.deg2rad(table.number["latitude_deg"])),
+        longitude=freeze(np.deg2rad(table.number["longitude_deg"])),
+        height=_known(table, "height_m"),
+        sigma_east=_known(table, "sigma_east_m"),
+        sigma_north=_known(table, "sigma_north_m"),
+        sigma_up=_known(table, "sigma_up_m"),
+        speed=_known(table, "speed_m_s"),
+        course=_angle(table, "course_deg"),
+        sigma_speed=_known(table, "sigma_speed_m_s"),
+        quality=_known(table, "quality"),
+        satellites=_known(table, "satellites"),
+        hdop=_known(table, "hdop"),
+        lever_arm_b=_fixed(stream.lever_arm_m),
+        frame=stream.frame,
+        receiver=stream.receiver,
+    )
+
+
+def _imu(table: Table, time: FloatArray, stream: _Imu) -> ImuStream:
+    return ImuStream(
+        time=time,
+        gyro=freeze(np.column_stack([table.number[f"gyro_{axis}_rad_s"] for axis in "xyz"])),
+        specific_force=freeze(np.column_stack([table.number[f"accel_{axis}_m_s2"] for axis in "xyz"])),
+        lever_arm_b=_fixed(stream.lever_arm_m),
+        mounting=_fixed(np.deg2rad(stream.mounting_deg).tolist()),
+    )
+
+
+def _odometer(table: Table, time: FloatArray, stream: _Odometer) -> OdometerStream:
+    distance, speed = _known(table, "distance_m"), _known(table, "speed_m_s")
+    if distance is None and speed is None:
+        cause = "neither distance_m nor speed_m_s has values"
+        raise RunError(cause, file=table.file, row=1, remedy="an odometer needs one of these columns")
+    empty = np.ones(table.length, dtype=bool)
+    for values in (distance, speed):
+        if values is not None:
+            empty &= np.isnan(values)
+    if empty.any():
+        column = "distance_m" if distance is not None else "speed_m_s"
+        table.refuse(int(np.argmax(empty)), column, "is empty or not a number", "remove rows without a reading")
+    if distance is not None and not stream.signed:
+        known = np.flatnonzero(~np.isnan(distance))
+        fallen = np.flatnonzero(np.diff(distance[known]) < -ODOMETER_NOISE)
+        if len(fallen):
+            before, now = known[fallen[0]], known[fallen[0] + 1]
+            cause = f"cumulative distance falls from {distance[before]:.12g} to {distance[now]:.12g} m"
+            table.refuse(
+                int(now), "distance_m", cause, f"set signed = true under [odometer] in {CONTENTS}, or split the run"
+            )
+    return OdometerStream(time, distance, speed, _known(table, "sigma_speed_m_s"), stream.signed)
+
+
+def _gyro_angles(table: Table, time: FloatArray) -> GyroAnglesStream:
+    roll, pitch, heading = (freeze(np.deg2rad(table.number[f"{name}_deg"])) for name in ("roll", "pitch", "heading"))
+    return GyroAnglesStream(time, roll, pitch, heading)
+
+
+def _gauge(table: Table, time: FloatArray) -> GaugeStream:
+    cant = _known(table, "cant_mm")
+    return GaugeStream(time, freeze(table.number["gauge_mm"] / 1000), None if cant is None else freeze(cant / 1000))
+
+
+def _balise(table: Table, time: FloatArray) -> BaliseStream:
+    return BaliseStream(time, tuple(table.words["id"].each()), _known(table, "sigma_m"))
+
+
+#: Decimals in the text files of a run.
+_DECIMALS: Mapping[str, int] = {
+    "time_s": 6,
+    "latitude_deg": 10,
+    "longitude_deg": 10,
+    "height_m": 5,
+    "speed_m_s": 6,
+    "course_deg": 6,
+    "sigma_east_m": 5,
+    "sigma_north_m": 5,
+    "sigma_up_m": 5,
+    "sigma_speed_m_s": 6,
+    "quality": 0,
+    "satellites": 0,
+    "hdop": 3,
+    **{f"gyro_{axis}_rad_s": 10 for axis in "xyz"},
+    **{f"accel_{axis}_m_s2": 8 for axis in "xyz"},
+    "distance_m": 5,
+    "roll_deg": 8,
+    "pitch_deg": 8,
+    "heading_deg": 8,
+    "gauge_mm": 4,
+    "cant_mm": 4,
+    "sigma_m": 5,
+}
+
+
+def _stream_columns(run: Run, name: str) -> dict[str, FloatArray | Words]:
+    """Columns of a stream in the units of its file; those it does not have are left out."""
+    stream: Any = getattr(run, name)
+    if stream is None:
+        return {}
+    columns: dict[str, Any] = {"time_s": stream.time}
+    match stream:
+        case GnssStream():
+            columns |= {
+                "latitude_deg": np.rad2deg(stream.latitude),
+                "longitude_deg": np.rad2deg(stream.longitude),
+                "height_m": stream.height,
+                "sigma_east_m": stream.sigma_east,
+                "sigma_north_m": stream.sigma_north,
+                "sigma_up_m": stream.sigma_up,
+                "speed_m_s": stream.speed,
+                "course_deg": None if stream.course is None else np.rad2deg(stream.course),
+                "sigma_speed_m_s": stream.sigma_speed,
+                "quality": stream.quality,
+                "satellites": stream.satellites,
+                "hdop": stream.hdop,
+            }
+        case ImuStream():
+            columns |= {f"gyro_{axis}_rad_s": stream.gyro[:, i] for i, axis in enumerate("xyz")}
+            columns |= {f"accel_{axis}_m_s2": stream.specific_force[:, i] for i, axis in enumerate("xyz")}
+        case OdometerStream():
+            columns |= {
+                "distance_m": stream.distance,
+                "speed_m_s": stream.speed,
+                "sigma_speed_m_s": stream.sigma_speed,
+            }
+        case GyroAnglesStream():
+            columns |= {
+                "roll_deg": np.rad2deg(stream.roll),
+                "pitch_deg": np.rad2deg(stream.pitch),
+                "heading_deg": np.rad2deg(stream.heading),
+            }
+        case GaugeStream():
+            columns |= {
+                "gauge_mm": stream.gauge * 1000,
+                "cant_mm": None if stream.cant is None else stream.cant * 1000,
+            }
+        case BaliseStream():
+            columns |= {"id": Words.of(stream.id), "sigma_m": stream.sigma}
+    return {key: value for key, value in columns.items() if value is not None}
