@@ -1,0 +1,246 @@
+"""What the verbs know of files: is an output path usable, and what kind of thing is an input."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from collections.abc import Iterable, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from railnav.errors import InputError, RailnavError
+
+if TYPE_CHECKING:
+    from railnav.navigation.solution import Solution
+    from railnav.track.model import TrackModel
+
+MODEL_ENDINGS = (".gpkg", ".geojson", ".json")
+SOLUTION_ENDINGS = (".csv", ".parquet", ".gpkg", ".geojson")
+PAGE_ENDINGS = (".html",)
+PICTURE_ENDINGS = (".png", ".svg", ".pdf", ".html")
+
+Kind = Literal["model", "solution", "run", "truth"]
+
+
+def check_output(path: Path, endings: Sequence[str], *, inputs: Iterable[Path] = ()) -> Path:
+    """Refuse an output file that could not be written at the end, before the work begins.
+
+    Parameters
+    ----------
+    path : Path
+        Where the output shall go. A file that is there already is replaced.
+    endings : sequence of str
+        The endings that name a format.
+    inputs : iterable of Path
+        Files that the output must not replace.
+
+    Returns
+    -------
+    Path
+        The path, as given.
+
+    Raises
+    ------
+    InputError
+        If the ending is unknown, the folder is missing or closed, the path is a folder, or it is one of the inputs.
+
+    Examples
+    --------
+    >>> check_output(Path("line.shp"), (".gpkg", ".geojson"))
+    Traceback (most recent call last):
+    railnav.errors.InputError: line.shp: an output of this ending is not known; use .gpkg or .geojson
+    """
+    if path.suffix.lower() not in endings:
+        choice = " or ".join(filter(None, [", ".join(endings[:-1]), endings[-1]]))
+        raise InputError("an output of this ending is not known", file=path, remedy=f"use {choice}")
+    if path.is_dir():
+        raise InputError("is a folder, not a file to write", file=path)
+    _check_folder(path)
+    for source in inputs:
+        if _same(path, source):
+            raise InputError("is also an input and would be overwritten", file=path, remedy="choose another output")
+    return path
+
+
+def check_output_folder(path: Path, *, mark: str | None = None) -> Path:
+    """Refuse an output folder that holds something already, or whose parent is missing or closed.
+
+    Parameters
+    ----------
+    path : Path
+        Folder to make.
+    mark : str, optional
+        Name of a file that only this program writes there: a folder that holds it may be replaced.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be made, or would replace what is not ours.
+    """
+    if path.exists() and not path.is_dir():
+        raise InputError("is a file, not a folder to write", file=path)
+    _check_folder(path)
+    if path.is_dir() and any(path.iterdir()) and not (mark and (path / mark).is_file()):
+        raise InputError("the folder is not empty", file=path, remedy="choose a new folder, or remove this one first")
+    return path
+
+
+def _check_folder(path: Path) -> None:
+    folder = path.absolute().parent
+    if not folder.is_dir():
+        raise InputError(f"there is no folder {folder}", file=path, remedy="make it first")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise InputError(f"the folder {folder} is not writable", file=path)
+
+
+def _same(path: Path, source: Path) -> bool:
+    if path.resolve() == source.resolve():
+        return True
+    return path.exists() and source.exists() and path.samefile(source)
+
+
+def kind_of(path: Path) -> Kind:
+    """Tell what a file or folder holds, from its name and its first bytes.
+
+    Parameters
+    ----------
+    path : Path
+        A run folder (with run.toml), a model (.gpkg, .geojson), a solution (.csv, .parquet, .gpkg, .geojson) or a truth
+        file (.csv, .parquet).
+
+    Returns
+    -------
+    str
+        "run", "model", "solution" or "truth".
+
+    Raises
+    ------
+    InputError
+        If it is missing, or none of these.
+    """
+    if not path.exists():
+        raise InputError("no such file or folder", file=path)
+    if path.is_dir():
+        if not (path / "run.toml").is_file():
+            raise InputError("the folder holds no run.toml", file=path, remedy="name a run folder, or a file")
+        return "run"
+    if path.name == "run.toml":
+        raise InputError("is the table of contents of a run", file=path, remedy=f"name its folder, {path.parent}")
+    ending = path.suffix.lower()
+    if ending == ".gpkg":
+        return _kind_of_geopackage(path)
+    if ending in (".geojson", ".json"):
+        with path.open("rb") as file:
+            head = file.read(65536)
+        return "solution" if b'"Point"' in head and b'"LineString"' not in head else "model"
+    if ending in (".csv", ".parquet"):
+        names = _columns(path)
+        if {"track", "offset_m", "heading_deg"} <= names and "mode" not in names:
+            return "truth"
+        return "solution"
+    raise InputError(
+        "neither a model (.gpkg, .geojson), a solution (.csv, .parquet, .gpkg, .geojson) nor a run folder", file=path
+    )
+
+
+def _columns(path: Path) -> set[str]:
+    if path.suffix.lower() == ".csv":
+        with path.open("rb") as file:
+            return {name.strip().strip('"') for name in file.readline(65536).decode("utf-8", "replace").split(",")}
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        return set(pq.read_schema(path).names)
+    except pa.ArrowException as error:
+        raise InputError(f"not a Parquet file ({error})", file=path) from error
+
+
+def _kind_of_geopackage(path: Path) -> Kind:
+    """Tell a solution's GeoPackage from a model's by the column `mode` of its only feature table."""
+    try:
+        connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
+        try:
+            tables = [row[0] for row in connection.execute("SELECT table_name FROM gpkg_contents")]
+            solution = any(
+                {"mode", "sigma_along_m"}
+                <= {row[0] for row in connection.execute("SELECT name FROM pragma_table_info(?)", (table,))}
+                for table in tables
+            )
+        finally:
+            connection.close()
+    except sqlite3.Error as error:
+        raise InputError(f"not a GeoPackage ({error})", file=path) from error
+    return "solution" if solution else "model"
+
+
+def read_model(path: Path) -> TrackModel:
+    """Read a model, .gpkg or .geojson."""
+    if path.suffix.lower() in (".geojson", ".json"):
+        from railnav.io.geojson import read_geojson
+
+        return read_geojson(path)
+    from railnav.io.geopackage import read_model as read_geopackage
+
+    return read_geopackage(path)
+
+
+def read_solution(path: Path) -> Solution:
+    """Read a solution by its ending."""
+    from railnav.io.solution import read_solution as read
+
+    return read(path)
+
+
+def write_model(model: TrackModel, path: Path) -> None:
+    """Write a model, .gpkg or .geojson."""
+    if path.suffix.lower() in (".geojson", ".json"):
+        from railnav.io.geojson import write_geojson
+
+        write_geojson(model, path)
+        return
+    from railnav.io.geopackage import write_model as write_geopackage
+
+    write_geopackage(model, path)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a page, whole or not at all."""
+    from railnav.io.atomic import atomic_path
+
+    with atomic_path(path) as draft:
+        draft.write_text(text, encoding="utf-8")
+
+
+def members(run: Path) -> list[Path]:
+    """List the files of a run folder, which no output may replace; empty where there is no such folder."""
+    return sorted(run.iterdir()) if run.is_dir() else []
+
+
+def need_report() -> None:
+    """Refuse to begin what needs the extra "report" when it is not installed.
+
+    Raises
+    ------
+    RailnavError
+        If plotly or matplotlib is not there.
+    """
+    missing = [name for name in ("matplotlib", "plotly") if find_spec(name) is None]
+    if missing:
+        raise RailnavError(
+            f'pages and pictures need {" and ".join(missing)}; install with: pip install "railnav[report]"'
+        )
+
+
+def run_defects(run: Path) -> list[tuple[str, str, str]]:
+    """Judge a run folder: what is wrong with it, as (kind, where, what)."""
+    from railnav.io.run import read_run
+
+    try:
+        read_run(run)
+    except InputError as error:
+        where = ", ".join([str(error.file or run), *([f"row {error.row}"] if error.row else [])])
+        where += f", column {error.column}" if error.column else ""
+        return [("run", where, f"{error.cause}; {error.remedy}" if error.remedy else error.cause)]
+    return []

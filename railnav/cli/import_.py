@@ -1,0 +1,68 @@
+"""`railnav import`: a track network from elsewhere becomes a model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from railnav.cli._verb import PATH, crs_options, json_option
+
+
+@click.command("import")
+@click.argument("source", type=PATH)
+@click.option("-o", "--output", type=PATH, required=True, help="Model to write, .gpkg.")
+@crs_options
+@click.option("--spacing", type=click.FloatRange(0, min_open=True), default=1.0, show_default=True, help="Knots, m.")
+@json_option
+def command(
+    source: Path,
+    output: Path,
+    crs: str | None,
+    zone_width: str | None,
+    ellipsoid: str | None,
+    spacing: float,
+    as_json: bool,
+) -> None:
+    """Turn a track network (GeoJSON or elements CSV) into a reference track model.
+
+    GeoJSON (.geojson, .json): one LineString a track, in WGS 84, property `track`. Elements (.csv): straights, arcs
+    and clothoids with the coordinates of their start; --crs names their plane.
+
+    \b
+    Example:
+      railnav import demo/line.geojson -o imported.gpkg
+    """  # noqa: D301
+    from railnav.cli import _files
+    from railnav.cli._describe import describe_model, print_model
+    from railnav.cli._terminal import print_json
+    from railnav.cli._verb import frame_request
+    from railnav.errors import InputError
+
+    _files.check_output(output, (".gpkg",), inputs=[source])
+    request = frame_request(crs, zone_width, ellipsoid)
+    ending = source.suffix.lower()
+    if not source.is_file():
+        raise InputError("no such file", file=source)
+    if ending in (".geojson", ".json"):
+        from railnav.io.geojson import read_geojson
+
+        model = read_geojson(source, **request, spacing=spacing)
+    elif ending == ".csv":
+        from railnav.io.elements import read_elements
+
+        if crs is None:
+            raise InputError(
+                "elements need the plane of their coordinates", file=source, remedy="name it, e.g. --crs EPSG:31467"
+            )
+        model = read_elements(source, crs=crs, spacing=spacing)
+    else:
+        raise InputError(
+            "a network of this ending cannot be imported", file=source, remedy="use .geojson, .json or elements .csv"
+        )
+    model.to_file(output)
+    facts = describe_model(model)
+    if as_json:
+        print_json({**facts, "output": output})
+    else:
+        print_model(facts, f"{output} written")

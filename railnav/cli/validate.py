@@ -1,0 +1,54 @@
+"""`railnav validate`: every defect at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from railnav.cli._verb import PATH, json_option
+
+
+@click.command("validate")
+@click.argument("file", type=PATH)
+@json_option
+@click.pass_context
+def command(ctx: click.Context, file: Path, as_json: bool) -> None:
+    """Check a model or a run and report every defect at once.
+
+    Of a model: gaps, kinks, tracks twice, missing heights, impossible turnouts, parts without connection, knots that
+    contradict their offsets. Of a run folder: every stream is read and judged. Exit code 1 if anything is wrong.
+
+    \b
+    Example:
+      railnav validate demo/line.gpkg
+    """  # noqa: D301
+    from railnav.cli import _files
+    from railnav.cli._terminal import print_json, print_table
+    from railnav.errors import InputError
+    from railnav.web import words
+
+    kind = _files.kind_of(file)
+    if kind == "model":
+        from railnav.track.validation import validate
+
+        defects = [(d.kind, d.where, d.detail) for d in validate(_files.read_model(file))]
+    elif kind == "run":
+        defects = _files.run_defects(file)
+    else:
+        raise InputError(f"a {kind} cannot be validated", file=file, remedy="name a model or a run folder")
+    if as_json:
+        print_json(
+            {
+                "file": file,
+                "kind": kind,
+                "valid": not defects,
+                "defects": [{"kind": k, "where": where, "detail": detail} for k, where, detail in defects],
+            }
+        )
+    elif defects:
+        print_table(f"{file}: {words.count(len(defects), 'defect')}", ("defect", "where", "what"), defects, left=3)
+    else:
+        click.echo(f"{file}: no defects found ({kind})")
+    if defects:
+        ctx.exit(1)

@@ -1,0 +1,1 @@
+"""Pages and pictures: they show results and compute none. Needs the extra "report" (plotly, matplotlib)."""

@@ -1,0 +1,42 @@
+"use strict";
+// Draws the figures of the page, and moves the train in the plan while the pointer moves over a chart along time.
+(function () {
+  const figures = JSON.parse(document.getElementById("figures").textContent);
+  const config = {
+    responsive: true,
+    displaylogo: false,
+    showLink: false,
+    showEditInChartStudio: false,
+    sendData: false,
+    plotlyServerURL: "",
+    topojsonURL: "",
+    modeBarButtonsToRemove: ["lasso2d", "select2d", "autoScale2d"],
+    toImageButtonOptions: { format: "svg" },
+  };
+  const drawn = {};
+  for (const figure of figures) {
+    const place = document.getElementById(figure.id);
+    drawn[figure.id] = Plotly.newPlot(place, figure.data, figure.layout, config);
+    place.figure = figure;
+  }
+  const plan = document.getElementById("plan");
+  const marker = plan && plan.figure.marker;
+  if (!marker) return;
+  const nearest = function (time) {
+    let low = 0, high = marker.time.length - 1;
+    while (low < high) {
+      const middle = (low + high) >> 1;
+      if (marker.time[middle] < time) low = middle + 1; else high = middle;
+    }
+    return low > 0 && time - marker.time[low - 1] < marker.time[low] - time ? low - 1 : low;
+  };
+  for (const figure of figures) {
+    if (!figure.moves) continue;
+    drawn[figure.id].then(function (place) {
+      place.on("plotly_hover", function (event) {
+        const k = nearest(event.points[0].x);
+        Plotly.restyle(plan, { x: [[marker.x[k]]], y: [[marker.y[k]]] }, [marker.trace]);
+      });
+    });
+  }
+})();

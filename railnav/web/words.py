@@ -1,0 +1,120 @@
+"""Figures in words: one way to write a length, a time, a share or a speed, on pages, pictures and in the terminal.
+
+A missing value (None or NaN) is written as an en dash.
+"""
+
+from __future__ import annotations
+
+import math
+
+NOTHING = "\N{EN DASH}"
+
+
+def _missing(value: float | None) -> bool:
+    return value is None or not math.isfinite(value)
+
+
+def figures(value: float | None, digits: int = 3) -> str:
+    """Write a number with so many significant digits, without an exponent where it is readable without.
+
+    Examples
+    --------
+    >>> figures(0.012345), figures(1234.5), figures(None)
+    ('0.0123', '1,234', '–')
+    """
+    if value is None or _missing(value):
+        return NOTHING
+    if value == 0:
+        return "0"
+    decimals = digits - 1 - math.floor(math.log10(abs(value)))
+    if decimals > 7:
+        return f"{value:.{digits - 1}g}"
+    return f"{value:,.{max(decimals, 0)}f}"
+
+
+def length(value: float | None, digits: int = 3) -> str:
+    """Write a length given in metres, in the unit that reads best.
+
+    Examples
+    --------
+    >>> length(0.0042), length(0.42), length(25312.4), length(float("nan"))
+    ('4.20 mm', '0.420 m', '25.3 km', '–')
+    """
+    if value is None or _missing(value):
+        return NOTHING
+    size = abs(value)
+    if 0 < size < 0.1:
+        return f"{figures(value * 1e3, digits)} mm"
+    if size >= 10_000:
+        return f"{figures(value / 1e3, digits)} km"
+    return f"{figures(value, digits)} m"
+
+
+def exact_length(value: float | None) -> str:
+    """Write a length given in metres to the millimetre.
+
+    Examples
+    --------
+    >>> exact_length(25312.4006)
+    '25,312.401 m'
+    """
+    return NOTHING if value is None or _missing(value) else f"{value:,.3f} m"
+
+
+def duration(value: float | None) -> str:
+    """Write a time given in seconds.
+
+    Examples
+    --------
+    >>> duration(4.21), duration(754.2), duration(7512.0)
+    ('4.2 s', '12 min 34 s', '2 h 05 min')
+    """
+    if value is None or _missing(value):
+        return NOTHING
+    if value < 60:
+        return f"{value:.1f} s"
+    minutes, seconds = divmod(round(value), 60)
+    if minutes < 60:
+        return f"{minutes} min {seconds:02d} s"
+    return f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def share(value: float | None) -> str:
+    """Write a share of 1 as a percentage that says 100 % only when it is all.
+
+    Examples
+    --------
+    >>> share(1.0), share(0.99999), share(0.2512), share(0.0)
+    ('100 %', '99.99 %', '25.1 %', '0 %')
+    """
+    if value is None or _missing(value):
+        return NOTHING
+    percent = 100 * value
+    if percent in (0.0, 100.0):
+        return f"{percent:.0f} %"
+    decimals = 2 if percent >= 99 or percent < 1 else 1
+    scale = 10**decimals
+    percent = math.floor(percent * scale) / scale if percent > 50 else math.ceil(percent * scale) / scale
+    return f"{percent:.{decimals}f} %"
+
+
+def speed(value: float | None) -> str:
+    """Write a speed given in m/s, in km/h.
+
+    Examples
+    --------
+    >>> speed(44.444)
+    '160 km/h'
+    """
+    return NOTHING if value is None or _missing(value) else f"{value * 3.6:.0f} km/h"
+
+
+def count(value: int, one: str, many: str = "") -> str:
+    """Write a count with its noun.
+
+    Examples
+    --------
+    >>> count(1, "run"), count(12345, "fix", "fixes")
+    ('1 run', '12,345 fixes')
+    """
+    return f"{value:,} {one if value == 1 else many or one + 's'}"
