@@ -1,0 +1,285 @@
+"""Sensors and their errors: what each one measures, how wrong it is, and ready-made outfits.
+
+An error is the sum of the parts that a filter must tell apart: white noise, a first-order Gauss-Markov part with a correlation time,
+a constant drawn once a run, and rare gross errors. Every sensor draws from a generator of its own, so that leaving one out changes
+nothing in the others.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+_DEGREE = math.pi / 180.0
+
+
+@dataclass(frozen=True, slots=True)
+class GnssSensor:
+    """A GNSS receiver.
+
+    Attributes
+    ----------
+    interval : float
+        Time between fixes, s.
+    lever_arm_b : (3,) tuple
+        Reference point to antenna: forward, right, down, m.
+    white_horizontal, white_vertical : float
+        Sigma of the white part, per axis, m.
+    coloured_horizontal, coloured_vertical : float
+        Sigma of the first-order Gauss-Markov part, per axis, m.
+    correlation_time : float
+        Of the Gauss-Markov part, s.
+    speed_sigma : float
+        Sigma of each horizontal velocity component, m/s.
+    outlier_probability, outlier_size : float
+        Probability of a gross error a fix, and its sigma per axis, m; the stated sigma does not tell.
+    frame_offset : (3,) tuple
+        Constant offset of the receiver's frame: east, north, up, m.
+    stated_factor : float
+        Stated sigma over true sigma: 1 is an honest receiver; 0 states none.
+    reacquisition : float
+        Time without fixes after an outage, s.
+    quality : float
+        What the quality column says.
+    receiver : str
+        Kind of receiver.
+    """
+
+    interval: float = 1.0
+    lever_arm_b: tuple[float, float, float] = (1.2, 0.0, -3.1)
+    white_horizontal: float = 0.5
+    white_vertical: float = 0.9
+    coloured_horizontal: float = 1.4
+    coloured_vertical: float = 2.4
+    correlation_time: float = 60.0
+    speed_sigma: float = 0.05
+    outlier_probability: float = 0.0
+    outlier_size: float = 25.0
+    frame_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    stated_factor: float = 1.0
+    reacquisition: float = 2.0
+    quality: float = 1.0
+    receiver: str = "simulated"
+
+    @property
+    def sigma_horizontal(self) -> float:
+        """True sigma of one horizontal axis, m."""
+        return math.hypot(self.white_horizontal, self.coloured_horizontal)
+
+    @property
+    def sigma_vertical(self) -> float:
+        """True sigma of the height, m."""
+        return math.hypot(self.white_vertical, self.coloured_vertical)
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSensor:
+    """Three gyros and three accelerometers.
+
+    Attributes
+    ----------
+    interval : float
+        Time between samples, s.
+    lever_arm_b : (3,) tuple
+        Reference point to IMU: forward, right, down, m.
+    mounting : (3,) tuple
+        Nominal roll, pitch, yaw that turn body axes into IMU axes, rad.
+    mounting_sigma : float
+        Sigma of what remains unknown of each mounting angle, rad.
+    gyro_white, accelerometer_white : float
+        Angular random walk, rad/sqrt(s), and velocity random walk, m/s/sqrt(s): a sample's sigma is this over sqrt(interval).
+    gyro_bias, accelerometer_bias : float
+        Sigma of the bias at switch-on, rad/s and m/s^2.
+    gyro_bias_walk, accelerometer_bias_walk : float
+        Random walk of the biases, rad/s/sqrt(s) and m/s^2/sqrt(s).
+    gyro_scale, accelerometer_scale : float
+        Sigma of each axis's scale error.
+    """
+
+    interval: float = 0.01
+    lever_arm_b: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    mounting_sigma: float = 0.2 * _DEGREE
+    gyro_white: float = 0.2 * _DEGREE / 60.0
+    accelerometer_white: float = 0.04 / 60.0
+    gyro_bias: float = 0.03 * _DEGREE
+    accelerometer_bias: float = 0.02
+    gyro_bias_walk: float = 1e-6
+    accelerometer_bias_walk: float = 2e-5
+    gyro_scale: float = 1e-3
+    accelerometer_scale: float = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class OdometerSensor:
+    """A wheel that counts.
+
+    Attributes
+    ----------
+    interval : float
+        Time between readings, s.
+    scale_sigma : float
+        Sigma of the relative scale error (wheel diameter).
+    scale_error : float or None
+        This scale error instead of a drawn one.
+    roughness : float
+        Random walk of the reading with distance, m/sqrt(m).
+    resolution : float
+        Distance a count, m; 0 for none.
+    slip_rate : float
+        Expected slips an hour while power or brakes are on.
+    slip_size, slip_duration : float
+        Mean relative slip, and its mean duration, s: the wheel runs ahead under power and falls behind under brakes.
+    signed : bool
+        Whether backing up subtracts.
+    """
+
+    interval: float = 0.1
+    scale_sigma: float = 3e-3
+    scale_error: float | None = None
+    roughness: float = 2e-3
+    resolution: float = 0.01
+    slip_rate: float = 0.0
+    slip_size: float = 0.08
+    slip_duration: float = 4.0
+    signed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class AnglesSensor:
+    """A gyroscopic sensor of roll, pitch and heading.
+
+    Attributes
+    ----------
+    interval : float
+        s.
+    white : float
+        Sigma of each reading, rad.
+    bias : float
+        Sigma of each angle's constant error, rad.
+    """
+
+    interval: float = 0.2
+    white: float = 0.01 * _DEGREE
+    bias: float = 0.01 * _DEGREE
+
+
+@dataclass(frozen=True, slots=True)
+class GaugeSensor:
+    """A sensor of gauge and cant.
+
+    Attributes
+    ----------
+    interval : float
+        s.
+    sigma : float
+        Sigma of each reading, m.
+    gauge : float
+        True gauge, m.
+    """
+
+    interval: float = 0.2
+    sigma: float = 0.0005
+    gauge: float = 1.435
+
+
+@dataclass(frozen=True, slots=True)
+class Outfit:
+    """The sensors of one train; None for those it does not carry."""
+
+    name: str
+    gnss: GnssSensor | None = None
+    imu: ImuSensor | None = None
+    odometer: OdometerSensor | None = None
+    angles: AnglesSensor | None = None
+    gauge: GaugeSensor | None = None
+
+
+#: Survey car: carrier-phase GNSS of 2 cm, attitude, gauge and cant, calibrated odometer.
+SURVEY = Outfit(
+    "survey",
+    gnss=GnssSensor(
+        interval=0.2,
+        lever_arm_b=(0.5, 0.0, -3.6),
+        white_horizontal=0.017,
+        white_vertical=0.025,
+        coloured_horizontal=0.010,
+        coloured_vertical=0.020,
+        correlation_time=60.0,
+        speed_sigma=0.02,
+        outlier_probability=0.001,
+        outlier_size=1.0,
+        quality=4.0,
+        receiver="carrier phase",
+    ),
+    odometer=OdometerSensor(scale_sigma=2e-4, roughness=5e-4, resolution=0.001),
+    angles=AnglesSensor(),
+    gauge=GaugeSensor(),
+)
+
+#: Train in service: code GNSS with coloured errors (1.5 m), MEMS IMU, odometer.
+SERVICE = Outfit(
+    "service",
+    gnss=GnssSensor(outlier_probability=0.002),
+    imu=ImuSensor(),
+    odometer=OdometerSensor(slip_rate=4.0),
+)
+
+#: Telephone on the window sill: GNSS alone, slowly wandering, too sure of itself.
+PHONE = Outfit(
+    "phone",
+    gnss=GnssSensor(
+        lever_arm_b=(0.0, 1.2, -2.2),
+        white_horizontal=1.0,
+        white_vertical=2.0,
+        coloured_horizontal=2.8,
+        coloured_vertical=4.5,
+        correlation_time=120.0,
+        speed_sigma=0.2,
+        outlier_probability=0.005,
+        stated_factor=0.8,
+        reacquisition=6.0,
+        receiver="phone",
+    ),
+)
+
+#: Outfits by name.
+OUTFITS = {outfit.name: outfit for outfit in (SURVEY, SERVICE, PHONE)}
+
+
+def gauss_markov(
+    generator: np.random.Generator, count: int, interval: float, sigma: float, correlation_time: float
+) -> FloatArray:
+    """First-order Gauss-Markov sequence, stationary from its first value.
+
+    x[k + 1] = phi x[k] + sqrt(1 - phi^2) sigma w[k], phi = exp(-interval / correlation_time), w white and standard normal.
+
+    Parameters
+    ----------
+    generator : numpy Generator
+    count : int
+    interval, correlation_time : float
+        s.
+    sigma : float
+        Standard deviation of every value.
+
+    Returns
+    -------
+    (count,) array
+
+    Examples
+    --------
+    >>> gauss_markov(np.random.default_rng(1), 3, 1.0, 0.0, 60.0)
+    array([0., 0., 0.])
+    """
+    from scipy.signal import lfilter
+
+    phi = math.exp(-interval / correlation_time)
+    drive = generator.standard_normal(count)
+    drive[1:] *= math.sqrt(1.0 - phi * phi)
+    return np.asarray(sigma * lfilter([1.0], [1.0, -phi], drive))
