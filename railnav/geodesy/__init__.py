@@ -18,6 +18,7 @@ from railnav.geodesy.ellipsoid import (
     Ellipsoid,
 )
 from railnav.geodesy.grid import GridFrame, choose_frame
+from railnav.geodesy.transformation import GeodeticFrame, geodetic_frame
 
 __all__ = [
     "BESSEL",
@@ -28,6 +29,8 @@ __all__ = [
     "PZ90",
     "WGS84",
     "Ellipsoid",
+    "GeodeticFrame",
     "GridFrame",
     "choose_frame",
+    "geodetic_frame",
 ]

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -18,15 +17,23 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from railnav.errors import CrsError
-from railnav.geodesy.ellipsoid import Ellipsoid
+from railnav.geodesy.projection import projection_of
+from railnav.geodesy.transformation import (
+    DEGREE,
+    PER_DEGREE,
+    Extent,
+    forward,
+    inverse,
+    pin_operation,
+    registered,
+    shortened,
+    wrapped_deg,
+)
 
 if TYPE_CHECKING:
     import pyproj
 
 FloatArray = NDArray[np.float64]
-
-_DEGREE = math.pi / 180.0
-_PER_DEGREE = 180.0 / math.pi
 
 #: Largest |k - 1| of a usable plane: beyond, bearings and lengths are those of another country.
 _LARGEST_DISTORTION = 0.01
@@ -34,15 +41,23 @@ _LARGEST_DISTORTION = 0.01
 _LARGEST_ANISOTROPY = 1e-3
 #: Degrees that data may lie outside a registered area of use.
 _AREA_MARGIN_DEG = 3.0
-#: Step of the numerical derivatives of projections without a closed form, m.
-_STEP = 1000.0
 
-# EPSG codes of Pulkovo 1942 / 3-degree Gauss-Kruger, zones 7 to 64
-_PULKOVO_3_DEGREE = {
-    **{zone: 2516 + zone for zone in range(7, 34)},
-    **{zone: 2517 + zone for zone in range(34, 60)},
-    60: 3389,
-    **{zone: 2517 + zone for zone in range(61, 65)},
+# EPSG codes of the Gauss-Kruger zones on the Krassowsky ellipsoid by width and zone, the eastern realisation first
+_PULKOVO = {
+    6: (
+        {zone: 28400 + zone for zone in range(4, 33)},  # Pulkovo 1942
+        {2: 3834, 3: 3835, 4: 3836},  # Pulkovo 1942(83)
+        {2: 3833, 3: 3333, 4: 3334, 5: 3335},  # Pulkovo 1942(58)
+    ),
+    3: (
+        {
+            **{zone: 2516 + zone for zone in range(7, 34)},
+            **{zone: 2517 + zone for zone in range(34, 65)},
+            60: 3389,
+        },
+        {3: 2397, 4: 2398, 5: 2399, 6: 3841, 7: 4417, 8: 4434},
+        {3: 3837, 4: 3838, 5: 3329, 6: 3330, 7: 3331, 8: 3332, 9: 3839, 10: 3840},
+    ),
 }
 
 
@@ -115,13 +130,12 @@ class GridFrame:
         >>> round(float(easting), 3), round(float(northing), 3), round(float(height), 3)
         (4500000.0, 5262834.867, 120.0)
         """
-        transformer = _transformer(self.pipeline)
         if isinstance(latitude, float) and isinstance(longitude, float) and isinstance(height, float):  # one live fix
-            one: tuple[Any, Any, Any] = transformer.transform(longitude * _PER_DEGREE, latitude * _PER_DEGREE, height)
+            one = forward(self.pipeline, longitude * PER_DEGREE, latitude * PER_DEGREE, height)
             if math.isfinite(one[0]) and math.isfinite(one[1]) and math.isfinite(one[2]):
                 return one
         latitude, longitude, height_, missing = _positions(latitude, longitude, height)
-        easting, northing, up = transformer.transform(longitude * _PER_DEGREE, latitude * _PER_DEGREE, height_)
+        easting, northing, up = forward(self.pipeline, longitude * PER_DEGREE, latitude * PER_DEGREE, height_)
         _refuse_unprojected(self, (easting, northing, up), latitude, longitude, geodetic=True)
         return _shaped(easting, latitude), _shaped(northing, latitude), _shaped(np.where(missing, np.nan, up), latitude)
 
@@ -156,16 +170,16 @@ class GridFrame:
         >>> round(float(np.degrees(latitude)), 6), round(float(np.degrees(longitude)), 6)
         (47.5, 21.0)
         """
-        from pyproj.enums import TransformDirection
-
+        if isinstance(easting, float) and isinstance(northing, float) and isinstance(height, float):
+            longitude, latitude, up = inverse(self.pipeline, easting, northing, height)
+            if math.isfinite(longitude) and math.isfinite(latitude) and math.isfinite(up):
+                return latitude * DEGREE, longitude * DEGREE, up
         easting, northing, height_, missing = _positions(easting, northing, height)
-        longitude, latitude, up = _transformer(self.pipeline).transform(
-            easting, northing, height_, direction=TransformDirection.INVERSE
-        )
+        longitude, latitude, up = inverse(self.pipeline, easting, northing, height_)
         _refuse_unprojected(self, (longitude, latitude, up), easting, northing, geodetic=False)
         return (
-            _shaped(latitude * _DEGREE, easting),
-            _shaped(longitude * _DEGREE, easting),
+            _shaped(latitude * DEGREE, easting),
+            _shaped(longitude * DEGREE, easting),
             _shaped(np.where(missing, np.nan, up), easting),
         )
 
@@ -184,7 +198,7 @@ class GridFrame:
 
         Notes
         -----
-        Of the projection alone: true north is that of the frame's own datum, within 1e-5 rad of that of WGS 84. Closed
+        Of the projection alone: true north is that of the frame's own datum, within 4e-5 rad of that of WGS 84. Closed
         for the transverse Mercator (Karney's series, 1e-14 rad); by derivatives of the projection otherwise (1e-11 rad).
 
         References
@@ -197,8 +211,7 @@ class GridFrame:
         >>> round(float(np.degrees(frame.convergence(4600000.0, 5263000.0))), 4)
         0.9784
         """
-        easting, northing, _, _ = _positions(easting, northing, None)
-        return _shaped(_plane(self.pipeline).factors(easting.ravel(), northing.ravel())[1], easting)
+        return self._factor(1, easting, northing)
 
     def point_scale(self, easting: ArrayLike, northing: ArrayLike) -> FloatArray:
         """Point scale of the projection, k: grid metres per metre on the ellipsoid of the frame's datum.
@@ -219,8 +232,17 @@ class GridFrame:
         >>> round(float(frame.point_scale(4600000.0, 5263000.0) - 1) * 1e6, 1)  # ppm, 100 km off the meridian
         122.8
         """
-        easting, northing, _, _ = _positions(easting, northing, None)
-        return _shaped(_plane(self.pipeline).factors(easting.ravel(), northing.ravel())[2], easting)
+        return self._factor(2, easting, northing)
+
+    def _factor(self, which: int, easting: ArrayLike, northing: ArrayLike) -> FloatArray:
+        """One of latitude, convergence, point scale."""
+        projection = projection_of(self.pipeline)
+        if isinstance(easting, float) and isinstance(northing, float) and math.isfinite(easting + northing):
+            value: FloatArray = projection.factors(np.array([easting]), np.array([northing]))[which][0]
+            return value
+        east, north = _broadcast(easting, northing)
+        _refuse_not_finite(east, north)
+        return _shaped(projection.factors(east.ravel(), north.ravel())[which], east)
 
     def ground_scale(
         self, easting: ArrayLike, northing: ArrayLike, height: ArrayLike | None, grid_bearing: ArrayLike
@@ -257,7 +279,9 @@ class GridFrame:
         )
         _refuse_not_finite(easting, northing, bearing)
         height_ = np.where(np.isnan(height_), 0.0, height_)
-        scale = _plane(self.pipeline).line_scale(easting.ravel(), northing.ravel(), height_.ravel(), bearing.ravel())
+        scale = projection_of(self.pipeline).line_scale(
+            easting.ravel(), northing.ravel(), height_.ravel(), bearing.ravel()
+        )
         return _shaped(scale, easting)
 
     def ground_length(
@@ -312,7 +336,7 @@ class GridFrame:
         _refuse_not_finite(e1, n1, e2, n2)
         flat = np.isnan(h1) | np.isnan(h2)
         h1, h2 = np.where(flat, 0.0, h1), np.where(flat, 0.0, h2)
-        length = _plane(self.pipeline).ground_length(*(v.ravel() for v in (e1, n1, h1, e2, n2, h2)))
+        length = projection_of(self.pipeline).ground_length(*(v.ravel() for v in (e1, n1, h1, e2, n2, h2)))
         return _shaped(length, e1)
 
     @property
@@ -343,8 +367,8 @@ def choose_frame(
         Width of the Gauss-Krueger zones in degrees: zone z = floor(lon/6) + 1 with central meridian 6 z - 3, or
         z = round(lon/3) with 3 z; scale 1 on it, false easting z 1e6 + 500,000 m.
     ellipsoid : {"wgs84", "krassowsky", "bessel"}
-        "wgs84": the pure projection of WGS 84, no datum shift, accuracy 0; "krassowsky": Pulkovo 1942; "bessel": DB_REF
-        (3-degree zones 2 to 5, Germany).
+        "wgs84": the pure projection of WGS 84, no datum shift, accuracy 0; "krassowsky": Pulkovo 1942,
+        or its realisations 1942(83) and 1942(58) west of it; "bessel": DB_REF (3-degree zones 2 to 5, Germany).
 
     Returns
     -------
@@ -370,7 +394,7 @@ def choose_frame(
     >>> choose_frame(np.radians(47.4), np.radians(8.5), crs="EPSG:2056").accuracy
     1.0
     """
-    extent = _Extent.of(latitude, longitude)
+    extent = Extent.of(latitude, longitude)
     if isinstance(crs, str) and crs.strip().lower() in {"gk3", "gk6"}:
         zone_width, crs = int(crs.strip()[2]), None
     if zone_width not in {3, 6}:
@@ -384,48 +408,10 @@ def choose_frame(
         return _pin(_read_crs(crs), extent, asked=str(crs))
     if kind == "wgs84":
         return _pin(_gauss_krueger_wgs84(extent.longitude, zone_width), extent, asked=f"gk{zone_width}")
-    code = _pulkovo(extent, zone_width) if kind.startswith("krass") else _db_ref(extent, zone_width)
+    if kind.startswith("krass"):
+        return _pulkovo(extent, zone_width)
+    code = _db_ref(extent, zone_width)
     return _pin(_read_crs(f"EPSG:{code}"), extent, asked=f"EPSG:{code}")
-
-
-@dataclass(frozen=True, slots=True)
-class _Extent:
-    """Where data lies, degrees; east may exceed 180 where it crosses the antimeridian."""
-
-    west: float
-    south: float
-    east: float
-    north: float
-
-    @classmethod
-    def of(cls, latitude: ArrayLike, longitude: ArrayLike) -> _Extent:
-        lat, lon = (np.degrees(v).ravel() for v in _broadcast(latitude, longitude))
-        if len(lat) == 0:
-            raise CrsError("no positions to choose a coordinate system by; give at least one")
-        bad = ~(np.isfinite(lat) & np.isfinite(lon)) | (np.abs(lat) > 90.0) | (np.abs(lon) > 360.0)
-        if bad.any():
-            i = int(np.argmax(bad))
-            raise CrsError(
-                f"position {i + 1} is no geodetic one (latitude {lat[i]:g}, longitude {lon[i]:g} degrees); "
-                "latitude and longitude are radians, in this order"
-            )
-        centre = math.degrees(
-            math.atan2(float(np.median(np.sin(lon * _DEGREE))), float(np.median(np.cos(lon * _DEGREE))))
-        )
-        lon = centre + np.mod(lon - centre + 180.0, 360.0) - 180.0
-        (south, north), (west, east) = np.quantile(lat, [0.005, 0.995]), np.quantile(lon, [0.005, 0.995])
-        return cls(float(west), float(south), float(east), float(north))
-
-    @property
-    def longitude(self) -> float:
-        return 0.5 * (self.west + self.east)
-
-    @property
-    def latitude(self) -> float:
-        return 0.5 * (self.south + self.north)
-
-    def __str__(self) -> str:
-        return f"{self.latitude:.2f} N {self.longitude:.2f} E"
 
 
 def _zone_6(longitude_deg: float) -> int:
@@ -470,20 +456,28 @@ def _wgs84_base() -> str:
     return wkt[wkt.index("BASEGEOGCRS[") : wkt.index(",CONVERSION[")]
 
 
-def _pulkovo(extent: _Extent, zone_width: int) -> int:
-    """EPSG code of the Pulkovo 1942 zone."""
+def _pulkovo(extent: Extent, zone_width: int) -> GridFrame:
+    """Pin the zone of the first Pulkovo 1942 realisation that serves the place."""
+    from pyproj import CRS
+
     zone = _zone_6(extent.longitude) if zone_width == 6 else _zone_3(extent.longitude)
-    if zone_width == 6 and 4 <= zone <= 32:
-        return 28400 + zone
-    if zone_width == 3 and zone in _PULKOVO_3_DEGREE:
-        return _PULKOVO_3_DEGREE[zone]
+    for codes in _PULKOVO[zone_width]:
+        if zone not in codes:
+            continue
+        system = CRS.from_epsg(codes[zone])
+        area = system.area_of_use
+        if area is not None and area.south - 1.0 <= extent.latitude <= area.north + 1.0:
+            try:
+                return _pin(system, extent, asked=f"EPSG:{codes[zone]}")
+            except CrsError:  # another realisation may have a transformation here
+                continue
     raise CrsError(
-        f"Pulkovo 1942 has no {zone_width}-degree Gauss-Krueger zone {zone} (data about {extent}); "
-        'use ellipsoid="wgs84" or name a system by crs='
+        f"no realisation of Pulkovo 1942 (Krassowsky) has a {zone_width}-degree Gauss-Krueger zone {zone} with a "
+        f'transformation about {extent}; use ellipsoid="wgs84" or name a system by crs='
     )
 
 
-def _db_ref(extent: _Extent, zone_width: int) -> int:
+def _db_ref(extent: Extent, zone_width: int) -> int:
     """EPSG code of the DB_REF zone."""
     zone = _zone_3(extent.longitude)
     if zone_width != 3:
@@ -507,7 +501,7 @@ def _read_crs(crs: Any) -> pyproj.CRS:
             system = CRS.from_user_input(crs)
     except (ProjError, TypeError, ValueError) as error:
         raise CrsError(
-            f"PROJ knows no coordinate system {_shortened(crs)!r}; give an EPSG code, WKT, a PROJ string, gk6 or gk3"
+            f"PROJ knows no coordinate system {shortened(crs)!r}; give an EPSG code, WKT, a PROJ string, gk6 or gk3"
         ) from error
     plain = system.source_crs if system.is_bound and system.source_crs is not None else system
     label = _label(system, crs)
@@ -528,123 +522,47 @@ def _read_crs(crs: Any) -> pyproj.CRS:
     return system
 
 
-def _shortened(text: Any) -> str:
-    words = " ".join(str(text).split())
-    return words if len(words) <= 80 else words[:77] + "..."
-
-
 def _label(system: pyproj.CRS, asked: Any) -> str:
-    return f"{_shortened(asked)} ({system.name})" if system.name not in {"unknown", "unnamed"} else _shortened(asked)
+    return f"{shortened(asked)} ({system.name})" if system.name not in {"unknown", "unnamed"} else shortened(asked)
 
 
-def _pin(system: pyproj.CRS, extent: _Extent, *, asked: str) -> GridFrame:
+def _pin(system: pyproj.CRS, extent: Extent, *, asked: str) -> GridFrame:
     """Pin one transformation from WGS 84 to a projected system and see that it serves the data."""
     from pyproj import CRS
 
     label = _label(system, asked)
     _refuse_far_outside(system, extent, label)
-    pipeline, operation, accuracy = _operation(CRS.from_epsg(4979), system, extent)
-    name = system.name if system.name not in {"unknown", "unnamed"} else _shortened(asked)
+    pipeline, operation, accuracy = pin_operation(CRS.from_epsg(4979), system, extent)
+    name = system.name if system.name not in {"unknown", "unnamed"} else shortened(asked)
     frame = GridFrame(" ".join(str(system.to_wkt("WKT2_2019")).split()), name, pipeline, operation, accuracy)
-    _refuse_distorted(frame, extent, label)
+    _refuse_distorted(frame, extent, label, asked)
     return frame
-
-
-def _operation(source: pyproj.CRS, target: pyproj.CRS, extent: _Extent) -> tuple[str, str, float]:
-    """The best operation between two systems that has a stated accuracy and needs no grid: pipeline, name, accuracy (m)."""
-    from pyproj.aoi import AreaOfInterest
-    from pyproj.exceptions import ProjError
-    from pyproj.transformer import TransformerGroup
-
-    bound = target.is_bound or source.is_bound
-    words = f"{_title(source)} to {_title(target)}"
-    # PROJ takes an area wider than the data: an operation must hold a little beyond the outermost fix
-    area: Any = AreaOfInterest(
-        _wrapped(extent.west - 0.01),
-        max(extent.south - 0.01, -90.0),
-        _wrapped(extent.east + 0.01),
-        min(extent.north + 0.01, 90.0),
-    )
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # "best transformation is not available": decided here, below
-            group = TransformerGroup(
-                source.to_3d(), target.to_3d(), always_xy=True, area_of_interest=area, allow_ballpark=False
-            )
-    except ProjError as error:
-        raise CrsError(f"PROJ has no transformation from {words}: {_shortened(error)}") from error
-    why = "PROJ has none that it can run"
-    for transformer in group.transformers:
-        definition = str(transformer.definition)
-        if "ballpark" in transformer.description.lower():
-            why = "PROJ offers only a ballpark one, which leaves the coordinates as they are"
-        elif "grids=" in definition:
-            why = "it would need grid files"
-        elif transformer.accuracy < 0 and not bound:
-            why = "its accuracy is unknown"
-        elif not definition.startswith("proj=") or not transformer.has_inverse:
-            why = "it cannot be written down or run backwards"
-        else:
-            operation = _plain_operation(transformer.description)
-            return definition, operation, max(float(transformer.accuracy), 0.0)
-    if not group.transformers and group.unavailable_operations:
-        why = "it would need grid files"
-    raise CrsError(f"no usable transformation from {words} about {extent}: {why}; {_remedy(target)}")
-
-
-def _title(system: pyproj.CRS) -> str:
-    code = _registered(system)
-    return f"{system.name} ({code[0]}:{code[1]})" if code else str(system.name)
-
-
-def _remedy(target: pyproj.CRS) -> str:
-    if target.is_compound:
-        return "use its horizontal part alone (heights then stay ellipsoidal), or gk6"
-    if not _registered(target):
-        return "add the datum's link to WGS 84 (+towgs84= or a WKT BoundCRS), or use gk6"
-    return "use another realisation of the datum, or a plane on WGS 84 such as gk6"
-
-
-def _plain_operation(description: str) -> str:
-    """An operation's name without the steps that only swap axes or promote dimensions."""
-    steps = [step.strip() for step in description.split(" + ")]
-    kept = [step for step in steps if not step.startswith(("axis order change", "Null geographic offset"))]
-    return " + ".join(kept) or description
-
-
-def _registered(system: pyproj.CRS) -> tuple[str, int] | None:
-    code = system.to_authority(min_confidence=100)
-    return (str(code[0]), int(code[1])) if code is not None and str(code[1]).isdigit() else None
 
 
 @lru_cache(maxsize=16)
 def _authority(crs_wkt: str) -> tuple[str, int] | None:
     from pyproj import CRS
 
-    return _registered(CRS.from_wkt(crs_wkt))
+    return registered(CRS.from_wkt(crs_wkt))
 
 
-def _wrapped(longitude_deg: float) -> float:
-    return (longitude_deg + 180.0) % 360.0 - 180.0
-
-
-def _refuse_far_outside(system: pyproj.CRS, extent: _Extent, label: str) -> None:
+def _refuse_far_outside(system: pyproj.CRS, extent: Extent, label: str) -> None:
     area = system.area_of_use
     if area is None:
         return
     middle = 0.5 * (area.west + (area.east if area.east >= area.west else area.east + 360.0))
     half = 0.5 * ((area.east - area.west) % 360.0 or 360.0)
     outside = max(
-        abs(_wrapped(extent.longitude - middle)) - half, extent.latitude - area.north, area.south - extent.latitude
+        abs(wrapped_deg(extent.longitude - middle)) - half, extent.latitude - area.north, area.south - extent.latitude
     )
     if outside > _AREA_MARGIN_DEG:
         raise CrsError(
-            f"the data lies about {extent}, {outside:.0f} degrees outside the area of use of {label} ({area.name}); "
+            f"the data lies about {extent}, {outside:.0f} degrees outside the area of use of {label} ({shortened(area.name)}); "
             "use a system made for that area, or gk6"
         )
 
 
-def _refuse_distorted(frame: GridFrame, extent: _Extent, label: str) -> None:
+def _refuse_distorted(frame: GridFrame, extent: Extent, label: str, asked: str) -> None:
     if max(abs(extent.south), abs(extent.north)) > 89.0:
         raise CrsError(
             f"the data lies within a degree of a pole, where {label} has no grid north; name a polar system by crs="
@@ -656,15 +574,18 @@ def _refuse_distorted(frame: GridFrame, extent: _Extent, label: str) -> None:
     ]
     latitude, longitude = np.radians(np.array(corners)).T
     easting, northing, _ = frame.to_grid(latitude, longitude, 0.0)
-    plane = _plane(frame.pipeline)
+    plane = projection_of(frame.pipeline)
     back = frame.to_geodetic(easting, northing, 0.0)
     _, _, scale = plane.factors(easting, northing)
     stretch = float(np.max(np.abs(scale - 1.0)))
     turned = np.hypot(back[0] - latitude, np.remainder(back[1] - longitude + math.pi, 2 * math.pi) - math.pi)
     if stretch > _LARGEST_DISTORTION or not float(np.max(turned)) < 1e-8:
+        remedy = "split the line or name one system for all of it by crs="
+        if not asked.startswith("gk"):
+            remedy = "split the line or use a system made for that area, or gk6"
         raise CrsError(
             f"{label} would change lengths by up to {stretch * 100:.2g} % over the data ({extent.west:.1f} to {extent.east:.1f} E, "
-            f"{extent.south:.1f} to {extent.north:.1f} N); split the line or use a system made for that area, or gk6"
+            f"{extent.south:.1f} to {extent.north:.1f} N); {remedy}"
         )
     anisotropy, handed = plane.shape(easting, northing)
     if not handed:
@@ -676,179 +597,6 @@ def _refuse_distorted(frame: GridFrame, extent: _Extent, label: str) -> None:
             f"{label} is not conformal: scales differ by {anisotropy * 100:.2g} % between directions, and bearings with them; "
             "use a conformal system such as gk6"
         )
-
-
-# --- a pinned pipeline at work -----------------------------------------------------------------------------------------
-
-
-@lru_cache(maxsize=32)
-def _transformer(pipeline: str) -> pyproj.Transformer:
-    from pyproj import Transformer
-    from pyproj.exceptions import ProjError
-
-    try:
-        return Transformer.from_pipeline(pipeline)
-    except ProjError as error:
-        raise CrsError(
-            f"PROJ cannot run the pinned transformation {_shortened(pipeline)!r}: {_shortened(error)}"
-        ) from error
-
-
-def _steps(pipeline: str) -> list[dict[str, str]]:
-    """The steps of a PROJ pipeline, each a dict of its parameters (flags have an empty value)."""
-    steps: list[dict[str, str]] = [{}]
-    for word in pipeline.split():
-        if word in {"step", "+step"}:
-            steps.append({})
-            continue
-        key, _, value = word.lstrip("+").partition("=")
-        steps[-1][key] = value
-    return [step for step in steps if step.get("proj", "pipeline") != "pipeline"]
-
-
-_NOT_PROJECTIONS = {
-    "affine", "axisswap", "cart", "deformation", "geogoffset", "gridshift", "helmert", "hgridshift", "molobadekas",
-    "molodensky", "noop", "pop", "push", "set", "tinshift", "unitconvert", "vgridshift", "xyzgridshift", "latlong", "longlat",
-}  # fmt: skip
-
-
-def _text(steps: Sequence[dict[str, str]]) -> str:
-    words = [" ".join(f"{key}={value}" if value else key for key, value in step.items()) for step in steps]
-    return "proj=pipeline step proj=unitconvert xy_in=deg xy_out=rad step " + " step ".join(words)
-
-
-@lru_cache(maxsize=32)
-def _plane(pipeline: str) -> _Plane:
-    steps = _steps(pipeline)
-    at = next((i for i, step in enumerate(steps) if step["proj"] not in _NOT_PROJECTIONS), None)
-    if at is None:
-        raise CrsError(f"the pinned transformation {_shortened(pipeline)!r} has no map projection in it")
-    from pyproj import Geod
-
-    projection = steps[at]
-    geod = Geod(
-        " ".join(f"+{k}={projection[k]}" for k in ("ellps", "a", "b", "rf", "f", "R", "datum") if k in projection)
-    )
-    ellipsoid = Ellipsoid(projection.get("ellps", "custom"), geod.a, 1.0 / geod.f if geod.f else 0.0)
-    datum_scale = 1.0  # metres of the datum per metre of WGS 84
-    for step in steps[:at]:
-        if step["proj"] in {"helmert", "molobadekas"}:
-            factor = 1.0 + float(step.get("s", "0")) * 1e-6
-            datum_scale *= 1.0 / factor if "inv" in step else factor
-    text = _text(steps[at:])
-    if (
-        projection["proj"] in {"tmerc", "utm", "etmerc"}
-        and at == len(steps) - 1
-        and not {"axis", "approx", "inv"} & set(projection)
-    ):
-        return _TransverseMercator(ellipsoid, datum_scale, text, projection)
-    return _Plane(ellipsoid, datum_scale, text)
-
-
-class _Plane:
-    """A map projection with the metre of its datum: flat arrays in, flat arrays out."""
-
-    def __init__(self, ellipsoid: Ellipsoid, datum_scale: float, text: str) -> None:
-        self.ellipsoid = ellipsoid
-        self.datum_scale = datum_scale
-        self.text = text
-
-    def _derivatives(self, easting: FloatArray, northing: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Latitude (n,) and ground metres (east, north) per grid metre (easting, northing), (n, 2, 2), on the ellipsoid."""
-        from pyproj.enums import TransformDirection
-
-        transformer = _transformer(self.text)
-        offsets = np.array([0.0, -2.0, -1.0, 1.0, 2.0]) * _STEP
-        weights = np.array([0.0, 1.0, -8.0, 8.0, -1.0]) / (12.0 * _STEP)  # fourth order, central
-        lon0, lat0 = transformer.transform(easting, northing, direction=TransformDirection.INVERSE)
-        latitude = lat0 * _DEGREE
-        metres = np.empty((len(easting), 2, 2))
-        to_east = self.ellipsoid.transverse_radius(latitude) * np.cos(latitude) * _DEGREE
-        to_north = self.ellipsoid.meridian_radius(latitude) * _DEGREE
-        for axis, (de, dn) in enumerate(((1.0, 0.0), (0.0, 1.0))):
-            lon, lat = transformer.transform(
-                easting[:, None] + de * offsets, northing[:, None] + dn * offsets, direction=TransformDirection.INVERSE
-            )
-            lon = np.remainder(lon - lon0[:, None] + 180.0, 360.0) - 180.0
-            metres[:, 0, axis] = (lon @ weights) * to_east
-            metres[:, 1, axis] = ((lat - lat0[:, None]) @ weights) * to_north
-        if not np.isfinite(metres).all():
-            i = int(np.argmax(~np.isfinite(metres).all(axis=(1, 2))))
-            raise CrsError(f"position {i + 1} (E {easting[i]:g}, N {northing[i]:g}) lies outside the plane")
-        return latitude, metres
-
-    def factors(self, easting: FloatArray, northing: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Latitude, convergence (rad) and point scale."""
-        latitude, metres = self._derivatives(easting, northing)
-        # the meridian's image runs along the second column of the inverse; grid north turns from it by the convergence
-        convergence = np.arctan2(metres[:, 0, 1], metres[:, 0, 0])
-        scale = 1.0 / np.sqrt(np.abs(np.linalg.det(metres)))
-        return latitude, convergence, scale
-
-    def shape(self, easting: FloatArray, northing: FloatArray) -> tuple[float, bool]:
-        """Largest relative difference of scale between directions, and whether axes are right-handed (east, north)."""
-        _, metres = self._derivatives(easting, northing)
-        singular = np.linalg.svd(metres, compute_uv=False)
-        return float(np.max(singular[:, 0] / singular[:, 1] - 1.0)), bool((np.linalg.det(metres) > 0.0).all())
-
-    def _along(self, easting: FloatArray, northing: FloatArray, bearing: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Grid metres per metre on the datum's ellipsoid in a direction, and the Euler radius there, m."""
-        latitude, metres = self._derivatives(easting, northing)
-        east = metres[:, 0, 0] * np.sin(bearing) + metres[:, 0, 1] * np.cos(bearing)
-        north = metres[:, 1, 0] * np.sin(bearing) + metres[:, 1, 1] * np.cos(bearing)
-        return 1.0 / np.hypot(east, north), self.ellipsoid.euler_radius(latitude, np.arctan2(east, north))
-
-    def line_scale(
-        self, easting: FloatArray, northing: FloatArray, height: FloatArray, bearing: FloatArray
-    ) -> FloatArray:
-        """Grid metres per horizontal ground metre."""
-        scale, radius = self._along(easting, northing, bearing)
-        return scale / (1.0 + height / radius) * self.datum_scale
-
-    def ground_length(
-        self, e1: FloatArray, n1: FloatArray, h1: FloatArray, e2: FloatArray, n2: FloatArray, h2: FloatArray
-    ) -> FloatArray:
-        """Length of straight grid segments with even rise, ground metres."""
-        de, dn = e2 - e1, n2 - n1
-        bearing = np.arctan2(de, dn)
-        k1, _ = self._along(e1, n1, bearing)
-        km, radius = self._along(0.5 * (e1 + e2), 0.5 * (n1 + n2), bearing)
-        k2, _ = self._along(e2, n2, bearing)
-        ellipsoidal = np.hypot(de, dn) * (1.0 / k1 + 4.0 / km + 1.0 / k2) / 6.0
-        horizontal = ellipsoidal * (1.0 + 0.5 * (h1 + h2) / radius)
-        return np.asarray(np.hypot(horizontal, h2 - h1) / self.datum_scale)
-
-
-class _TransverseMercator(_Plane):
-    """Transverse Mercator: convergence and scale by Karney's series."""
-
-    def __init__(self, ellipsoid: Ellipsoid, datum_scale: float, text: str, projection: dict[str, str]) -> None:
-        super().__init__(ellipsoid, datum_scale, text)
-        from railnav.geodesy._kernels import krueger_beta
-
-        k0 = 0.9996 if projection["proj"] == "utm" else float(projection.get("k", projection.get("k_0", "1")))
-        zone = projection.get("zone")
-        meridian = 6.0 * int(zone) - 183.0 if zone else float(projection.get("lon_0", "0"))
-        easting_0, northing_0 = _transformer(text).transform(meridian, 0.0)  # where the meridian meets the equator
-        f = ellipsoid.flattening
-        n = f / (2.0 - f)
-        a = ellipsoid.semi_major_axis
-        rectifying = a / (1.0 + n) * (1.0 + n**2 / 4.0 + n**4 / 64.0 + n**6 / 256.0)
-        head = [easting_0, northing_0, k0 * rectifying, k0 * rectifying / a, ellipsoid.eccentricity_squared]
-        self.parameters: FloatArray = np.concatenate([head, krueger_beta(n)])
-
-    def factors(self, easting: FloatArray, northing: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Latitude, convergence (rad) and point scale."""
-        from railnav.geodesy._kernels import transverse_mercator_factors
-
-        latitude, convergence, scale = np.empty_like(easting), np.empty_like(easting), np.empty_like(easting)
-        transverse_mercator_factors(easting, northing, self.parameters, latitude, convergence, scale)
-        return latitude, convergence, scale
-
-    def _along(self, easting: FloatArray, northing: FloatArray, bearing: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Grid metres per metre on the datum's ellipsoid (the same in every direction), and the Euler radius, m."""
-        latitude, convergence, scale = self.factors(easting, northing)
-        return scale, self.ellipsoid.euler_radius(latitude, bearing + convergence)
 
 
 # --- shapes and refusals -----------------------------------------------------------------------------------------------
