@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -368,7 +369,7 @@ def choose_frame(
         z = round(lon/3) with 3 z; scale 1 on it, false easting z 1e6 + 500,000 m.
     ellipsoid : {"wgs84", "krassowsky", "bessel"}
         "wgs84": the pure projection of WGS 84, no datum shift, accuracy 0; "krassowsky": Pulkovo 1942,
-        or its realisations 1942(83) and 1942(58) west of it; "bessel": DB_REF (3-degree zones 2 to 5, Germany).
+        or west of it 1942(83) or 1942(58), whichever is joined to WGS 84 most closely; "bessel": DB_REF (3-degree zones 2 to 5, Germany).
 
     Returns
     -------
@@ -457,9 +458,10 @@ def _wgs84_base() -> str:
 
 
 def _pulkovo(extent: Extent, zone_width: int) -> GridFrame:
-    """Pin the zone of the first Pulkovo 1942 realisation that serves the place."""
+    """Pin the zone of the Pulkovo 1942 realisation that is joined to WGS 84 most closely at the place."""
     from pyproj import CRS
 
+    found: list[GridFrame] = []
     zone = _zone_6(extent.longitude) if zone_width == 6 else _zone_3(extent.longitude)
     for codes in _PULKOVO[zone_width]:
         if zone not in codes:
@@ -467,10 +469,10 @@ def _pulkovo(extent: Extent, zone_width: int) -> GridFrame:
         system = CRS.from_epsg(codes[zone])
         area = system.area_of_use
         if area is not None and area.south - 1.0 <= extent.latitude <= area.north + 1.0:
-            try:
-                return _pin(system, extent, asked=f"EPSG:{codes[zone]}")
-            except CrsError:  # another realisation may have a transformation here
-                continue
+            with suppress(CrsError):  # another realisation may have a transformation here
+                found.append(_pin(system, extent, asked=f"EPSG:{codes[zone]}"))
+    if found:
+        return min(found, key=lambda frame: frame.accuracy)
     raise CrsError(
         f"no realisation of Pulkovo 1942 (Krassowsky) has a {zone_width}-degree Gauss-Krueger zone {zone} with a "
         f'transformation about {extent}; use ellipsoid="wgs84" or name a system by crs='

@@ -104,9 +104,11 @@ def test_pulkovo_zones_are_what_their_codes_say():
 
 
 def test_pulkovo_west_of_its_area_takes_the_realisation_that_serves():
-    assert choose_frame(*BUDAPEST, ellipsoid="krassowsky").name == "Pulkovo 1942(83) / Gauss-Kruger zone 4"
-    sofia = (math.radians(42.7), math.radians(23.3))
-    assert choose_frame(*sofia, ellipsoid="krassowsky").name == "Pulkovo 1942(58) / Gauss-Kruger zone 4"
+    dresden = (math.radians(51.05), math.radians(13.7))
+    assert choose_frame(*dresden, ellipsoid="krassowsky").name == "Pulkovo 1942(83) / Gauss-Kruger zone 3"
+    assert choose_frame(*BUDAPEST, ellipsoid="krassowsky").accuracy <= 4.0
+    gdansk = (math.radians(54.4), math.radians(18.6))
+    assert choose_frame(*gdansk, ellipsoid="krassowsky").name == "Pulkovo 1942(58) / Gauss-Kruger zone 4"
 
 
 def test_wild_fixes_do_not_move_the_zone():
