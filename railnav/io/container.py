@@ -348,10 +348,14 @@ class Reader:
         listed = ", ".join(f'"{column}"' for column in columns)
         return self.connection.execute(f"SELECT {listed} FROM {table} ORDER BY fid").fetchall()  # noqa: S608 - our names
 
-    def _check_columns(self, table: str, columns: Sequence[str]) -> None:
+    def columns(self, table: str) -> set[str]:
+        """Names of the columns of a table; refuse when it is missing."""
         if table not in self.tables():
             self.refuse("the table is missing", layer=table)
-        names = {row[1] for row in self.connection.execute(f"PRAGMA table_info({table})")}
+        return {row[1] for row in self.connection.execute(f"PRAGMA table_info({table})")}
+
+    def _check_columns(self, table: str, columns: Sequence[str]) -> None:
+        names = self.columns(table)
         for column in (*columns, "fid"):
             if column not in names:
                 self.refuse(f"column {column!r} is missing", layer=table)

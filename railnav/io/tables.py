@@ -462,14 +462,13 @@ def _words(chunked: Any) -> Words:
     if isinstance(encoded, pa.ChunkedArray):
         encoded = encoded.chunk(0) if encoded.num_chunks else pa.array([], pa.string()).dictionary_encode()
     code = encoded.indices.cast(pa.int64()).fill_null(-1).to_numpy(zero_copy_only=False).astype(np.int64)
-    raw = [word or "" for word in encoded.dictionary.cast(pa.string()).to_pylist()]
-    stripped = [word.strip() for word in raw]
-    unique = tuple(dict.fromkeys(word for word in stripped if word))
-    place = {word: index for index, word in enumerate(unique)}
-    recode = np.array(
-        [place.get(word, -1) for word in stripped] + [-1], dtype=np.int64
-    )  # the last entry serves code -1
-    return Words(freeze(recode[code]), unique)
+    stripped = [(word or "").strip() for word in encoded.dictionary.cast(pa.string()).to_pylist()]
+    used, first = np.unique(code, return_index=True)
+    seen = [stripped[c] for c in used[np.argsort(first)].tolist() if c >= 0]  # in the order of their first row
+    word = tuple(dict.fromkeys(text for text in seen if text))
+    place = {text: index for index, text in enumerate(word)}
+    recode = np.array([place.get(text, -1) for text in stripped] + [-1], dtype=np.int64)  # the last serves code -1
+    return Words(freeze(recode[code]), word)
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
@@ -506,4 +505,5 @@ def _write_parquet(path: Path, columns: Mapping[str, FloatArray | Words], metada
     table = pa.table({name: _arrow(column, None) for name, column in columns.items()})
     if metadata is not None:
         table = table.replace_schema_metadata({"railnav": json.dumps(metadata, allow_nan=False)})
-    parquet.write_table(table, path, compression="zstd", write_page_checksum=True)
+    words = [name for name, column in columns.items() if isinstance(column, Words)]  # numbers seldom repeat
+    parquet.write_table(table, path, compression="zstd", use_dictionary=words, write_page_checksum=True)
