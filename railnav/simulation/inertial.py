@@ -126,7 +126,8 @@ def interval_means(
 
     Notes
     -----
-    The attitude turns evenly within an interval: at 100 Hz on a railway the neglected part stays below 1e-7 m/s^2.
+    The attitude turns evenly within an interval: at 100 Hz on a railway the neglected part stays below 1e-7 m/s^2. Integrated
+    again over four minutes and 2.4 km, the means give the motion back to 0.4 mm (tests/simulation/test_inertial.py).
 
     References
     ----------

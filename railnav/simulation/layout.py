@@ -120,7 +120,7 @@ def turnout_connection(
     Examples
     --------
     >>> round(sum(e.length for e in turnout_connection(4.0, number=9, radius=300.0)), 2)
-    73.33
+    71.38
     """
     side, angle, bend = math.copysign(1.0, lateral), math.atan(1.0 / number), 1.0 / radius
     arc = angle * radius - ramp

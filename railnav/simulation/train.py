@@ -176,7 +176,8 @@ def simulate(
 
     Notes
     -----
-    Twenty minutes with a 100 Hz IMU take about 0.5 s.
+    Twenty minutes with a 100 Hz IMU take about 0.5 s. The vehicle is rigid and follows the track under its reference point: where
+    a cant ramp begins it rolls at once, and an IMU on a long lever arm feels a knock that suspension would soften.
 
     Examples
     --------
