@@ -26,7 +26,8 @@ def _resolve(path: str | Path) -> Path:
     try:
         target = path.resolve()
         folder_exists = target.parent.is_dir()
-    except (OSError, ValueError, RuntimeError) as error:  # a loop of links, a NUL in the name
+        target.exists()
+    except (OSError, ValueError, RuntimeError) as error:  # a loop of links, a NUL in the name, a name too long
         raise InputError(f"is no usable path ({error})", file=path, remedy="choose another place") from error
     if not folder_exists:
         raise InputError(f"the folder {path.parent} does not exist", file=path, remedy="create it first")

@@ -370,8 +370,10 @@ class Reader:
         """Read the BLOB cells of one row, a long row one by one, so that memory holds one of them."""
         listed = ", ".join(columns)
         sizes = " + ".join(f"length({name})" for name in columns)
-        (size,) = self.connection.execute(f"SELECT {sizes} FROM {table} WHERE fid = ?", (fid,)).fetchone()  # noqa: S608
-        if size < _LONG_ROW_BYTES:
+        found = self.connection.execute(f"SELECT {sizes} FROM {table} WHERE fid = ?", (fid,)).fetchone()  # noqa: S608
+        if not found or found[0] is None:
+            self.refuse(f"row {fid} cannot be found again", layer=table)
+        if found[0] < _LONG_ROW_BYTES:
             row = self.connection.execute(f"SELECT {listed} FROM {table} WHERE fid = ?", (fid,)).fetchone()  # noqa: S608
             yield from zip(columns, row, strict=True)
             return

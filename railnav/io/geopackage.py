@@ -461,7 +461,9 @@ def _read_knots(reader: Reader, track_id: tuple[str, ...]) -> tuple[IntArray, di
     for row, i in enumerate(place.tolist()):
         part = slice(int(knot_start[i]), int(knot_start[i + 1]))
         checksum = 0
-        for name, blob in reader.blobs("knots", BLOB_COLUMNS, int(fid[row])):
+        for (name, blob), length in zip(reader.blobs("knots", BLOB_COLUMNS, int(fid[row])), lengths[row], strict=True):
+            if not isinstance(blob, bytes) or len(blob) != length:
+                sizes.refuse(row, name, "changes between two readings")
             checksum = zlib.crc32(blob, checksum)
             values = np.frombuffer(blob, "<f8")
             knots[name][part] = values.reshape(-1, 6) if name == "covariance_g" else values
