@@ -1,4 +1,78 @@
-"""Square-root estimation: chains, filters and smoothers, gross-error tests and consistency. Pure linear algebra.
+"""Square-root estimation: chains, filters and smoothers, gross-error tests, consistency. Pure linear algebra.
 
-This room knows nothing of the Earth, of track or of trains.
+This room knows nothing of the Earth, of track or of trains. It takes whitened rows (unit noise) or roots of covariances, and
+rotates; no normal equations, no difference of covariances.
+
+- **Chain.** `Chain` holds the rows of a block-bidiagonal Gauss-Markov model, `solve_chain` gives all states with their
+  covariances, NIS and residual statistics, `ChainFilter` takes the same rows live in constant memory. `increment_chain` and
+  `constant_velocity_chain` make the rows of the usual states.
+- **Covariance roots.** `predict`, `update`, `smooth` on P_sqrt (lower triangular, positive diagonal, P = P_sqrt P_sqrt^T);
+  `inverse_root` whitens, `lower_root` takes roots, `repair_covariance` mends rounding. Compiled loops elsewhere call
+  `predict_kernel`, `innovation_variance_kernel`, `update_scalar_kernel`, `update_kernel` and `smooth_kernel` of
+  `railnav.estimation._kernels` directly.
+- **Tests.** `block_test`, `component_test`, `geometric_test`: is a measurement wrong? `nees`, `consistency`, `coverage`: does the
+  estimator know how wrong it is?
+- **Oracle.** `railnav.estimation.oracle`: the same answers by dense least squares, banded normal equations, plain numpy
+  rotations and the textbook Kalman filter, for tests and benchmarks.
+
+Conventions: innovation = measured - predicted; whitened numbers have unit variance; states are corrections to nominal values;
+epoch k couples to epoch k + 1 by M_k x_k + L_k x_(k+1) = u_k.
 """
+
+from railnav.estimation.chain import Chain, ChainSolution, solve_chain
+from railnav.estimation.chain_filter import BlockResult, ChainFilter, FilterEstimate, SweepResult
+from railnav.estimation.consistency import Consistency, Coverage, consistency, coverage, nees
+from railnav.estimation.gross_error import (
+    BlockTest,
+    GeometricTest,
+    block_test,
+    chi_square_limit,
+    component_test,
+    geometric_test,
+    geometric_tolerance,
+)
+from railnav.estimation.menus import constant_velocity_chain, increment_chain
+from railnav.estimation.square_root import (
+    RepairedCovariance,
+    Smoothed,
+    Update,
+    inverse_root,
+    lower_root,
+    predict,
+    repair_covariance,
+    smooth,
+    update,
+)
+
+__all__ = [
+    "BlockResult",
+    "BlockTest",
+    "Chain",
+    "ChainFilter",
+    "ChainSolution",
+    "Consistency",
+    "Coverage",
+    "FilterEstimate",
+    "GeometricTest",
+    "RepairedCovariance",
+    "Smoothed",
+    "SweepResult",
+    "Update",
+    "block_test",
+    "chi_square_limit",
+    "component_test",
+    "consistency",
+    "constant_velocity_chain",
+    "coverage",
+    "geometric_test",
+    "geometric_tolerance",
+    "increment_chain",
+    "inverse_root",
+    "lower_root",
+    "nees",
+    "predict",
+    "repair_covariance",
+    "smooth",
+    "solve_chain",
+    "update",
+]

@@ -1,21 +1,448 @@
-"""Inner loops of the estimation room: float64 C-contiguous arrays, no validation, arguments named here are overwritten.
+"""Inner loops of the estimation room: float64 C-contiguous arrays, no validation; "overwritten" says what changes.
 
-Kernels of another room may call these; after a change here, its numba cache must be emptied (numba watches one file only).
+Loops of another room may call these; after a change here, empty that room's numba cache (numba watches one file only).
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from functools import cache
+from typing import cast
 
 import numpy as np
-from numba import njit
+from numba import boolean, float64, int64, njit, types
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-#: A pivot of a data row this small against its row counts as empty (spec 15.8).
+#: A pivot this small against the row it would come from counts as empty (rail 15.8).
 PIVOT_TOLERANCE = 1e-12
+
+#: A variance this small, given the ones before it, against itself: the covariance is singular.
+VARIANCE_TOLERANCE = 1e-13
+
+
+# ---------------------------------------------------------------- rows into a triangle
+
+
+@njit(cache=True)
+def insert_row_kernel(W: FloatArray, row: FloatArray) -> tuple[int, float]:
+    """Rotate one row into the triangle [R | b] (rail 5, eqs 22-23); give (pivot, 0) if necessary, (-1, f) if redundant."""
+    # W (p, p + 1) upper triangular with its right-hand side, row (p + 1,): both overwritten
+    p = W.shape[0]
+    norm2 = 0.0
+    for j in range(p):
+        norm2 += row[j] * row[j]
+    floor = PIVOT_TOLERANCE * np.sqrt(norm2)
+    for j in range(p):
+        a = row[j]
+        if a == 0.0:
+            continue
+        r = W[j, j]
+        if r == 0.0:
+            if abs(a) <= floor:  # what rounding left of a zero is no information
+                row[j] = 0.0
+                continue
+            sign = 1.0 if a > 0.0 else -1.0
+            for i in range(j, p + 1):
+                W[j, i] = sign * row[i]
+                row[i] = 0.0
+            return j, 0.0
+        h = np.sqrt(r * r + a * a)
+        c = r / h
+        s = a / h
+        W[j, j] = h
+        row[j] = 0.0
+        for i in range(j + 1, p + 1):
+            t = W[j, i]
+            W[j, i] = c * t + s * row[i]
+            row[i] = c * row[i] - s * t
+    return -1, float(row[p])
+
+
+@njit(cache=True)
+def insert_rows_kernel(W: FloatArray, rows: FloatArray, count: int) -> tuple[float, int]:
+    """Rotate `count` rows in one by one; give the sum of f^2 and the number of redundant rows (rows of zeros are absent)."""
+    # W (p, p + 1), rows (at least count, p + 1): both overwritten
+    p = W.shape[0]
+    total = 0.0
+    redundant = 0
+    for i in range(count):
+        empty = True
+        for j in range(p):
+            if rows[i, j] != 0.0:
+                empty = False
+                break
+        if empty:
+            continue
+        pivot, f = insert_row_kernel(W, rows[i])
+        if pivot < 0:
+            total += f * f
+            redundant += 1
+    return total, redundant
+
+
+@njit(cache=True, inline="always")
+def _reflect(W: FloatArray, pivot: int, column: int, first: int, last: int, width: int) -> None:
+    """Clear a column of rows first..last-1 against the pivot row by one reflection (as q rotations, with one square root)."""
+    # W: work array, overwritten; its last row is scratch; the pivot row's element is >= 0 and stays so
+    scratch = W.shape[0] - 1
+    s = 0.0
+    for i in range(first, last):
+        s += W[i, column] * W[i, column]
+    if s != 0.0:
+        r = W[pivot, column]
+        h = np.sqrt(r * r + s)
+        inverse = 1.0 / h
+        g = 1.0 / (h + r)
+        W[pivot, column] = h
+        for c in range(column + 1, width):
+            W[scratch, c] = r * W[pivot, c]
+        for i in range(first, last):
+            a = W[i, column]
+            for c in range(column + 1, width):
+                W[scratch, c] += a * W[i, c]
+        for c in range(column + 1, width):
+            t = W[scratch, c] * inverse
+            W[scratch, c] = (W[pivot, c] + t) * g
+            W[pivot, c] = t
+        for i in range(first, last):
+            a = W[i, column]
+            for c in range(column + 1, width):
+                W[i, c] -= a * W[scratch, c]
+
+
+# ---------------------------------------------------------------- the chain, forward
+
+_READ_ONLY = (
+    types.Array(float64, 1, "C", readonly=True),
+    types.Array(float64, 2, "C", readonly=True),
+    types.Array(float64, 3, "C", readonly=True),
+    types.Array(int64, 1, "C", readonly=True),
+)
+
+
+@cache
+def forward_kernel(size: int) -> Callable[..., int]:
+    """Compile the forward sweep for states of one size (loops of constant length), or for any size (0)."""
+    # one signature, inputs read-only: otherwise each mixture of read-only and writable arrays would compile anew
+    f1, f2, f3, i1 = _READ_ONLY
+    out_f1, out_f2, out_f3, out_i1, out_b1 = float64[::1], float64[:, ::1], float64[:, :, ::1], int64[::1], boolean[::1]
+    signature = int64(
+        f3, f2, i1, f3, f3, f2, i1, int64, out_f2, f1, out_f3, out_f1, out_i1, out_b1, out_f1, out_i1, out_f2
+    )  # fmt: skip
+
+    @njit(signature, cache=True)
+    def forward(
+        H: FloatArray,
+        z: FloatArray,
+        counts: IntArray,
+        M: FloatArray,
+        L: FloatArray,
+        u: FloatArray,
+        link_counts: IntArray,
+        lead: int,
+        triangle: FloatArray,
+        limits: FloatArray,
+        records: FloatArray,
+        nis: FloatArray,
+        dof: IntArray,
+        rejected: NDArray[np.bool_],
+        link_nis: FloatArray,
+        link_dof: IntArray,
+        filtered: FloatArray,
+    ) -> int:
+        """Sweep a whitened block-bidiagonal chain: observe each epoch, eliminate it, carry the triangle on (rail 15.2)."""
+        # H (N | 1, m, n), z (N, m), counts (N,): observation rows, the first counts[k] of each epoch
+        # M, L (links | 1, q, n), u (links | 1, q), link_counts (links,): M_k x_k + L_k x_(k+1) = u_k
+        # lead 1: link 0 goes before epoch 0 (a chain continued), links = N; lead 0: links = N - 1
+        # triangle (n, n + 1): [R | b] of the current epoch, overwritten; limits (m + 1,): NIS by dof that a block may have
+        # out: records (links | 0, n, 2n + 1) [R_kk R_kn | d_k]; nis, dof, rejected (N,); link_nis, link_dof (links,);
+        # filtered (N | 0, n), NaN while the triangle is singular. Returns the first broken link, or -1
+        n = size if size > 0 else H.shape[2]
+        w = 2 * n + 1
+        epochs = z.shape[0]
+        links = link_counts.shape[0]
+        m = H.shape[1]
+        q = M.shape[1]
+        H_step = 1 if H.shape[0] > 1 else 0
+        M_step = 1 if M.shape[0] > 1 else 0
+        L_step = 1 if L.shape[0] > 1 else 0
+        u_step = 1 if u.shape[0] > 1 else 0
+        store = records.shape[0] > 0
+        estimate = filtered.shape[0] > 0
+        gate = limits.shape[0] > 0
+        broken = -1
+        W = np.zeros((n + max(m, q, n) + 1, w))  # work array; the last row is scratch
+        slow = np.zeros((2 * n, w))
+        slow_rows = np.zeros((q, w))
+        slow_triangle = np.zeros((n, n + 1))
+        slow_observations = np.zeros((m, n + 1))
+        for k in range(epochs):
+            link = k - 1 + lead
+            if 0 <= link < links:
+                # [R 0 | b] over the rows [M L | u]
+                full = True
+                for i in range(n):
+                    for c in range(i, n):
+                        W[i, c] = triangle[i, c]
+                    for c in range(n, 2 * n):
+                        W[i, c] = 0.0
+                    W[i, 2 * n] = triangle[i, n]
+                    full = full and triangle[i, i] > 0.0
+                used = 0
+                scale2 = 0.0
+                for i in range(link_counts[link]):
+                    size2 = 0.0
+                    for c in range(n):
+                        W[n + used, c] = M[link * M_step, i, c]
+                        W[n + used, n + c] = L[link * L_step, i, c]
+                    for c in range(2 * n):
+                        size2 += W[n + used, c] * W[n + used, c]
+                    if size2 != 0.0:  # a row of zeros is absent
+                        W[n + used, 2 * n] = u[link * u_step, i]
+                        scale2 += size2
+                        used += 1
+                if full and used >= n:
+                    for j in range(n):
+                        _reflect(W, j, j, n, n + used, w)
+                    for j in range(n):
+                        if W[n + j, n + j] < 0.0:
+                            for c in range(n + j, w):
+                                W[n + j, c] = -W[n + j, c]
+                        _reflect(W, n + j, n + j, n + j + 1, n + used, w)
+                        pivot = W[n + j, n + j]
+                        full = full and pivot * pivot > PIVOT_TOLERANCE * PIVOT_TOLERANCE * scale2
+                else:
+                    full = False
+                if full:
+                    total = 0.0
+                    for i in range(2 * n, n + used):
+                        total += W[i, 2 * n] * W[i, 2 * n]
+                    link_nis[link] = total
+                    link_dof[link] = used - n
+                    for i in range(n):
+                        for c in range(i, n):
+                            triangle[i, c] = W[n + i, n + c]
+                        triangle[i, n] = W[n + i, 2 * n]
+                else:  # a singular start, few rows or weak ones: row by row, necessary rows fill empty pivots
+                    for i in range(n):
+                        for c in range(w):
+                            slow[i, c] = 0.0
+                            slow[n + i, c] = 0.0
+                        for c in range(i, n):
+                            slow[i, c] = triangle[i, c]
+                        slow[i, 2 * n] = triangle[i, n]
+                    for i in range(link_counts[link]):
+                        for c in range(n):
+                            slow_rows[i, c] = M[link * M_step, i, c]
+                            slow_rows[i, n + c] = L[link * L_step, i, c]
+                        slow_rows[i, 2 * n] = u[link * u_step, i]
+                    link_nis[link], link_dof[link] = insert_rows_kernel(slow, slow_rows, link_counts[link])
+                    for i in range(n):
+                        for c in range(w):
+                            W[i, c] = slow[i, c]
+                        for c in range(i, n):
+                            triangle[i, c] = slow[n + i, n + c]
+                        triangle[i, n] = slow[n + i, 2 * n]
+                if broken < 0:
+                    tied = False
+                    for i in range(n):
+                        for c in range(n, 2 * n):
+                            if W[i, c] != 0.0:
+                                tied = True
+                                break
+                        if tied:
+                            break
+                    if not tied:
+                        broken = link
+                if store:
+                    for i in range(n):
+                        for c in range(i):
+                            records[link, i, c] = 0.0
+                        for c in range(i, w):
+                            records[link, i, c] = W[i, c]
+            # the rows [H | z] into [R | b], which stands in the right half of the work array
+            if gate:
+                for i in range(n):
+                    for c in range(i, n + 1):
+                        slow_triangle[i, c] = triangle[i, c]
+            full = True
+            for i in range(n):
+                full = full and triangle[i, i] > 0.0
+            if full:
+                for i in range(n):
+                    for c in range(i, n + 1):
+                        W[i, n + c] = triangle[i, c]
+                used = 0
+                for i in range(counts[k]):
+                    present = False
+                    for c in range(n):
+                        W[n + used, n + c] = H[k * H_step, i, c]
+                        present = present or H[k * H_step, i, c] != 0.0
+                    if present:
+                        W[n + used, 2 * n] = z[k, i]
+                        used += 1
+                for j in range(n):
+                    _reflect(W, j, n + j, n, n + used, w)
+                total = 0.0
+                for i in range(n, n + used):
+                    total += W[i, 2 * n] * W[i, 2 * n]
+                for i in range(n):
+                    for c in range(i, n + 1):
+                        triangle[i, c] = W[i, n + c]
+            else:
+                for i in range(counts[k]):
+                    for c in range(n):
+                        slow_observations[i, c] = H[k * H_step, i, c]
+                    slow_observations[i, n] = z[k, i]
+                total, used = insert_rows_kernel(triangle, slow_observations, counts[k])
+            nis[k] = total
+            dof[k] = used
+            rejected[k] = gate and used > 0 and total > limits[used]
+            if rejected[k]:
+                for i in range(n):
+                    for c in range(i, n + 1):
+                        triangle[i, c] = slow_triangle[i, c]
+            if estimate:
+                for i in range(n - 1, -1, -1):
+                    t = triangle[i, n]
+                    for c in range(i + 1, n):
+                        t -= triangle[i, c] * filtered[k, c]
+                    filtered[k, i] = t / triangle[i, i] if triangle[i, i] > 0.0 else np.nan
+                for i in range(n):
+                    if not triangle[i, i] > 0.0:
+                        for c in range(n):
+                            filtered[k, c] = np.nan
+        return broken
+
+    return cast("Callable[..., int]", forward)
+
+
+# ---------------------------------------------------------------- the chain, backward
+
+
+@njit(cache=True)
+def smooth_chain_kernel(records: FloatArray, last: FloatArray, state: FloatArray) -> int:
+    """Substitute backwards, x_k = R_kk^-1 (d_k - R_kn x_(k+1)) (rail 15.3); give k n + i of an empty pivot, or -1."""
+    # records (N - 1, n, 2n + 1), last (n, n + 1) [R | b] of the last epoch; state (N, n) out
+    links = records.shape[0]
+    n = last.shape[0]
+    for i in range(n - 1, -1, -1):
+        if last[i, i] == 0.0:
+            return int(links * n + i)
+        t = last[i, n]
+        for c in range(i + 1, n):
+            t -= last[i, c] * state[links, c]
+        state[links, i] = t / last[i, i]
+    for k in range(links - 1, -1, -1):
+        for i in range(n - 1, -1, -1):
+            if records[k, i, i] == 0.0:
+                return int(k * n + i)
+            t = records[k, i, 2 * n]
+            for c in range(n):
+                t -= records[k, i, n + c] * state[k + 1, c]
+            for c in range(i + 1, n):
+                t -= records[k, i, c] * state[k, c]
+            state[k, i] = t / records[k, i, i]
+    return -1
+
+
+@njit(cache=True)
+def invert_upper_kernel(R: FloatArray, inverse: FloatArray) -> None:
+    """Invert the upper triangle in the first n columns of R."""
+    # R (n, >= n) with non-zero diagonal; inverse (n, n) out, zeros below the diagonal
+    n = inverse.shape[0]
+    for j in range(n):
+        for i in range(n):
+            inverse[i, j] = 0.0
+        inverse[j, j] = 1.0 / R[j, j]
+        for i in range(j - 1, -1, -1):
+            t = 0.0
+            for c in range(i + 1, j + 1):
+                t -= R[i, c] * inverse[c, j]
+            inverse[i, j] = t / R[i, i]
+
+
+@njit(cache=True)
+def covariance_chain_kernel(records: FloatArray, last: FloatArray, covariance: FloatArray, lag_one: FloatArray) -> None:
+    """Carry covariances backwards: P_k = R_kk^-1 R_kk^-T + G_k P_(k+1) G_k^T, C_k = G_k P_(k+1) (rail 15.3)."""
+    # records (N - 1, n, 2n + 1), last (n, n + 1): pivots all positive; covariance (N, n, n), lag_one (N - 1 | 0, n, n) out
+    links = records.shape[0]
+    n = last.shape[0]
+    root = np.zeros((n, n))
+    G = np.zeros((n, n))
+    C = np.zeros((n, n))
+    invert_upper_kernel(last, root)
+    for i in range(n):
+        for j in range(i, n):
+            t = 0.0
+            for c in range(j, n):
+                t += root[i, c] * root[j, c]
+            covariance[links, i, j] = t
+            covariance[links, j, i] = t
+    for k in range(links - 1, -1, -1):
+        invert_upper_kernel(records[k], root)
+        for i in range(n):
+            for j in range(n):
+                t = 0.0
+                for c in range(i, n):
+                    t -= root[i, c] * records[k, c, n + j]
+                G[i, j] = t
+        for i in range(n):
+            for j in range(n):
+                t = 0.0
+                for c in range(n):
+                    t += G[i, c] * covariance[k + 1, c, j]
+                C[i, j] = t
+        for i in range(n):
+            for j in range(i, n):
+                t = 0.0
+                for c in range(j, n):
+                    t += root[i, c] * root[j, c]
+                for c in range(n):
+                    t += C[i, c] * G[j, c]
+                covariance[k, i, j] = t
+                covariance[k, j, i] = t
+        if lag_one.shape[0] > 0:
+            for i in range(n):
+                for j in range(n):
+                    lag_one[k, i, j] = C[i, j]
+
+
+# ---------------------------------------------------------------- whitening
+
+
+@njit(cache=True)
+def inverse_cholesky_kernel(K: FloatArray, out: FloatArray) -> int:
+    """Invert the Cholesky factor of each covariance, W = L^-1, K = L L^T; give the first that is none, or -1."""
+    # K (N, n, n) symmetric, only the lower triangle is read; out (N, n, n) lower triangular
+    n = K.shape[1]
+    C = np.zeros((n, n))
+    for k in range(K.shape[0]):
+        for j in range(n):
+            t = K[k, j, j]
+            for c in range(j):
+                t -= C[j, c] * C[j, c]
+            if not t > VARIANCE_TOLERANCE * K[k, j, j]:
+                return k
+            C[j, j] = np.sqrt(t)
+            for i in range(j + 1, n):
+                t = K[k, i, j]
+                for c in range(j):
+                    t -= C[i, c] * C[j, c]
+                C[i, j] = t / C[j, j]
+        for j in range(n):
+            for i in range(j):
+                out[k, i, j] = 0.0
+            out[k, j, j] = 1.0 / C[j, j]
+            for i in range(j + 1, n):
+                t = 0.0
+                for c in range(j, i):
+                    t -= C[i, c] * out[k, c, j]
+                out[k, i, j] = t / C[i, i]
+    return -1
 
 
 # ---------------------------------------------------------------- square roots of covariances
@@ -23,11 +450,9 @@ PIVOT_TOLERANCE = 1e-12
 
 @njit(cache=True)
 def triangularize_rows(A: FloatArray, rows: int) -> int:
-    """Reflect the columns of the first `rows` rows from the right until A = [L 0], L lower triangular, A A^T = L L^T; give the rank.
-
-    Each diagonal element is positive, or else its whole column is zero (a singular covariance).
-    """
-    # A (at least `rows`, k), k >= rows, overwritten; the rest of its rows are left alone
+    """Reflect columns until the first `rows` rows are [L 0], L lower triangular with L L^T = A A^T; give the rank."""
+    # A (at least `rows`, k), k >= rows, overwritten; rows beyond `rows` are left alone
+    # each diagonal element of L is positive, or else its whole column is zero (a singular covariance)
     k = A.shape[1]
     column = 0
     for i in range(rows):
@@ -117,7 +542,7 @@ def innovation_variance_kernel(P_sqrt: FloatArray, h: FloatArray, variance: floa
 def update_scalar_kernel(
     x: FloatArray, P_sqrt: FloatArray, h: FloatArray, innovation: float, variance: float
 ) -> tuple[float, float]:
-    """Let one scalar row in (Carlson's rotations, lower-triangular form); give NIS and the log of the innovation variance."""
+    """Let one scalar row in (Carlson's rotations, lower form); give NIS and the log of the innovation variance."""
     # x (n,) and P_sqrt (n, n) lower, overwritten; h (n,); innovation = measured - predicted; variance > 0
     n = x.shape[0]
     f = np.empty(n)
@@ -150,7 +575,7 @@ def update_kernel(
     x: FloatArray, P_sqrt: FloatArray, innovation: FloatArray, H: FloatArray, R_sqrt: FloatArray, S_sqrt: FloatArray
 ) -> tuple[float, float]:
     """Let a block of rows in by one triangular array; give NIS and ln det S, S_sqrt filled with the root of S."""
-    # x (n,) and P_sqrt (n, n) lower, overwritten; innovation (m,); H (m, n); R_sqrt (m, r), full row rank; S_sqrt (m, m) out
+    # x (n,) and P_sqrt (n, n) lower, overwritten; innovation (m,); H (m, n); R_sqrt (m, r), rank m; S_sqrt (m, m) out
     #   [ R_sqrt  H P_sqrt ]      [ S_sqrt    0     ]
     #   [   0      P_sqrt  ]  ->  [ K S_sqrt  P_sqrt+ ]
     n = x.shape[0]
@@ -204,7 +629,8 @@ def smooth_kernel(
 ) -> None:
     """Carry the smoothed next state back to this one (Rauch-Tung-Striebel in square roots)."""
     # x (n,) and P_sqrt (n, n) lower: filtered here, smoothed after; F (n, n), Q_sqrt (n, q) of the step from here;
-    # x_predicted (n,) the next state as predicted from here; x_smoothed, P_sqrt_smoothed the next state smoothed; gain (n, n) out
+    # x_predicted (n,): the next state as predicted from here; x_smoothed, P_sqrt_smoothed: the next state smoothed;
+    # gain (n, n) out: the covariance between this state and the next is gain P_smoothed
     #   [ F P_sqrt  Q_sqrt ]      [ P_sqrt-  0 ]
     #   [  P_sqrt     0    ]  ->  [    A     B ]     gain = A (P_sqrt-)^-1,  B B^T = P - gain P- gain^T
     n = x.shape[0]

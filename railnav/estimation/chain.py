@@ -1,0 +1,460 @@
+"""Block-bidiagonal Gauss-Markov chains, reduced by rotations to a triangular band: a filter forward, a smoother back.
+
+The unknowns x_0 ... x_(N-1), n numbers each, meet whitened rows only (unit noise): a prior R0 x_0 = b0, observations
+H_k x_k = z_k, and couplings M_k x_k + L_k x_(k+1) = u_k. Dynamics x+ = F x + g + w, w ~ N(0, Q) is L = W, M = -W F, u = W g with
+W^T W = Q^-1; increments, odometer differences and observations between two nodes are couplings as well. The estimate minimises
+the sum of squares of all rows. No normal equations are formed, and what has gone by is kept only as one n x (2n + 1) record an
+epoch, or not at all.
+
+**Coordinates are corrections to nominal ones.** Raw coordinates of 10^6 m cost nine digits that no algorithm gives back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from railnav.errors import EstimationError
+from railnav.estimation import _kernels
+from railnav.estimation.gross_error import chi_square_limit
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+#: State sizes whose sweep is compiled with loops of constant length: two to three times faster, a few seconds once.
+SPECIALISED_SIZES = (3, 6, 9)
+
+
+@dataclass(frozen=True, slots=True, eq=False, init=False)
+class Chain:
+    """Whitened rows of a block-bidiagonal Gauss-Markov model.
+
+    An array that is the same at every epoch may be given once: without its first axis, or with a first axis of one. A row
+    whose coefficients are all zero is absent.
+
+    Parameters
+    ----------
+    H : (N, m, n) array
+        Observation rows, whitened: (state units)^-1.
+    z : (N, m) array
+        Their right-hand sides, whitened, unit noise.
+    M, L : (N - 1, q, n) array
+        Coupling rows M_k x_k + L_k x_(k+1) = u_k, whitened; not needed for N = 1.
+    u : (N - 1, q) array
+        Their right-hand sides, whitened.
+    counts : (N,) integer array, optional
+        Only the first ``counts[k]`` observation rows of epoch k are used (0: no fix); the rest may be anything.
+    coupling_counts : (N - 1,) integer array, optional
+        The same for the couplings.
+    prior : ((r, n) array, (r,) array), optional
+        Whitened rows R0 x_0 = b0; none by default, and none is needed.
+    lead : {0, 1}
+        1: a stretch that continues a chain; coupling 0 leads to its first epoch, and there are N of them.
+
+    Raises
+    ------
+    EstimationError
+        Shapes do not fit each other, or there is no epoch.
+
+    Notes
+    -----
+    Arrays that are float64 and contiguous are kept as they are, not copied, and never written.
+
+    Examples
+    --------
+    >>> chain = Chain(np.ones((1, 1)), [[0.0], [1.1], [1.9]], [[-1.0]], [[1.0]], [[1.0], [1.0]])
+    >>> solve_chain(chain).state.ravel()
+    array([0.0125, 1.025 , 1.9625])
+    """
+
+    H: FloatArray
+    z: FloatArray
+    M: FloatArray
+    L: FloatArray
+    u: FloatArray
+    counts: IntArray
+    coupling_counts: IntArray
+    prior: tuple[FloatArray, FloatArray] | None
+    lead: int
+
+    def __init__(
+        self,
+        H: ArrayLike,
+        z: ArrayLike,
+        M: ArrayLike | None = None,
+        L: ArrayLike | None = None,
+        u: ArrayLike | None = None,
+        *,
+        counts: ArrayLike | None = None,
+        coupling_counts: ArrayLike | None = None,
+        prior: tuple[ArrayLike, ArrayLike] | None = None,
+        lead: int = 0,
+    ) -> None:
+        rhs = as_floats("z", z)
+        if rhs.ndim != 2 or len(rhs) == 0:
+            raise EstimationError(f"z has shape {rhs.shape}; a chain needs (N, m) with at least one epoch")
+        epochs, m = rhs.shape
+        links = epochs - 1 + lead
+        rows = _stack("H", H, epochs, m, None)
+        n = rows.shape[2]
+        if n == 0:
+            raise EstimationError("a state of no numbers cannot be estimated")
+        before = after = np.zeros((0, 0, n))
+        step = np.zeros((0, 0))
+        if M is not None and L is not None and u is not None:
+            step = as_floats("u", u)
+            step = step[np.newaxis] if step.ndim == 1 else step
+            if step.ndim != 2 or len(step) not in (1, links):
+                raise EstimationError(f"u has shape {step.shape}; {links} couplings need ({links}, q)")
+            before, after = _stack("M", M, links, step.shape[1], n), _stack("L", L, links, step.shape[1], n)
+        elif links:
+            raise EstimationError(f"{epochs} epochs need coupling rows M, L and u ({links} of them)")
+        used = _counts("counts", counts, epochs, m)
+        coupled = _counts("coupling_counts", coupling_counts, links, step.shape[1])
+        for name, value in (
+            ("H", rows),
+            ("z", rhs),
+            ("M", before),
+            ("L", after),
+            ("u", step),
+            ("counts", used),
+            ("coupling_counts", coupled),
+            ("prior", None if prior is None else prior_rows(prior, n)),
+            ("lead", lead),
+        ):
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+    @property
+    def n(self) -> int:
+        """Numbers in one state."""
+        return int(self.H.shape[2])
+
+    def blame(self) -> str:
+        """Say which input is not finite."""
+        for name, array, counts, what in (
+            ("H", self.H, self.counts, "epoch"),
+            ("z", self.z, self.counts, "epoch"),
+            ("M", self.M, self.coupling_counts, "coupling"),
+            ("L", self.L, self.coupling_counts, "coupling"),
+            ("u", self.u, self.coupling_counts, "coupling"),
+        ):
+            used = np.arange(array.shape[1]) < (counts[:, None] if len(array) > 1 else counts.max(initial=0))
+            values = array if array.ndim == 2 else array.sum(axis=2)
+            for k, row in np.argwhere(~np.isfinite(values) & used)[:1]:
+                return f"{name} is not finite at {what} {k}, row {row}; leave that row out by its count"
+        return "the right-hand sides overflow; estimate corrections to nominal values"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChainSolution:
+    """A chain solved.
+
+    Attributes
+    ----------
+    state : (N, n) array
+        Smoothed states: each estimated from all rows. The last one is the filter's estimate.
+    covariance : (N, n, n) array or None
+        Their covariances P_k.
+    lag_one : (N - 1, n, n) array or None
+        C_k = cov(x_k, x_(k+1)).
+    filtered : (N, n) array or None
+        Estimates from the rows up to each epoch; NaN until the rows determine them (`first_determined`).
+    nis, dof : (N,) array
+        Sum of squared residuals and number of redundant rows of each epoch's observations: nu^T S^-1 nu of the innovation,
+        chi-square with ``dof`` degrees of freedom if the model holds.
+    rejected : (N,) bool array
+        Epochs whose observations failed the gate and were left out (`nis` still says by how much).
+    coupling_nis, coupling_dof : (N - 1,) array
+        The same for coupling rows beyond those that carry the state on.
+    records : (N - 1, n, 2n + 1) array
+        [R_kk R_kn | d_k]: whitened rows that hold all the past knows of x_k given x_(k+1).
+    triangle : (n, n + 1) array
+        [R | b] of the last epoch.
+    """
+
+    state: FloatArray
+    covariance: FloatArray | None
+    lag_one: FloatArray | None
+    filtered: FloatArray | None
+    nis: FloatArray
+    dof: IntArray
+    rejected: BoolArray
+    coupling_nis: FloatArray
+    coupling_dof: IntArray
+    records: FloatArray
+    triangle: FloatArray
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations of the states (N, n), for unit weight 1.
+
+        Raises
+        ------
+        EstimationError
+            The chain was solved without covariances.
+        """
+        if self.covariance is None:
+            raise EstimationError(
+                "the chain was solved without covariances; solve_chain(..., covariance=True) gives them"
+            )
+        return np.asarray(np.sqrt(np.einsum("kii->ki", self.covariance)))
+
+    @property
+    def sum_of_squares(self) -> float:
+        """v^T v, the minimum that the estimate attains, over the rows that were used."""
+        return float(self.nis[~self.rejected].sum() + self.coupling_nis.sum())
+
+    @property
+    def redundancy(self) -> int:
+        """Number of redundant rows that were used: rows less unknowns."""
+        return int(self.dof[~self.rejected].sum() + self.coupling_dof.sum())
+
+    @property
+    def unit_weight_rms(self) -> float:
+        """Unit-weight RMS mu = sqrt(v^T v / redundancy): 1 if the stated covariances are honest (rail 5, step 8).
+
+        Raises
+        ------
+        EstimationError
+            There are no redundant rows, so nothing can be said.
+        """
+        if self.redundancy == 0:
+            raise EstimationError("no row is redundant: the chain cannot tell how well it fits")
+        return float(np.sqrt(self.sum_of_squares / self.redundancy))
+
+    @property
+    def first_determined(self) -> int:
+        """First epoch whose filtered estimate exists.
+
+        Raises
+        ------
+        EstimationError
+            The chain was solved without filtered estimates.
+        """
+        if self.filtered is None:
+            raise EstimationError("the chain was solved without filtered estimates; solve_chain(..., filtered=True)")
+        return int(np.argmax(np.isfinite(self.filtered).all(axis=1)))
+
+    def cross_covariance(self, i: int, j: int) -> FloatArray:
+        """Covariance of two states, cov(x_i, x_j) = G_i ... G_(j-1) P_j for i <= j (rail 15.3).
+
+        Parameters
+        ----------
+        i, j : int
+            Epochs, 0 <= i <= j < N.
+
+        Returns
+        -------
+        (n, n) array
+            Covariance of x_i (rows) with x_j (columns).
+
+        Raises
+        ------
+        EstimationError
+            The epochs are not in order or not there, or the chain was solved without covariances.
+        """
+        if self.covariance is None:
+            raise EstimationError(
+                "the chain was solved without covariances; solve_chain(..., covariance=True) gives them"
+            )
+        if not 0 <= i <= j < len(self.state):
+            raise EstimationError(f"epochs {i} and {j} are not 0 <= i <= j < {len(self.state)}")
+        n = self.state.shape[1]
+        out: FloatArray = self.covariance[j]
+        for k in range(j - 1, i - 1, -1):
+            out = np.asarray(-np.linalg.solve(self.records[k, :, :n], self.records[k, :, n : 2 * n] @ out), np.float64)
+        return out
+
+
+def solve_chain(
+    chain: Chain,
+    *,
+    covariance: bool = True,
+    filtered: bool = False,
+    gate: float | None = None,
+    allow_breaks: bool = False,
+) -> ChainSolution:
+    """Estimate all states of a chain: rotations forward, substitution back.
+
+    Forward, [R_k 0 | b_k] over [M_k L_k | u_k] is rotated to [R_kk R_kn | d_k] over [0 R | b] of the next epoch, whose observation
+    rows are rotated in after it; what they leave is NIS. Backwards, x_k = R_kk^-1 (d_k - R_kn x_(k+1)),
+    P_k = R_kk^-1 R_kk^-T + G_k P_(k+1) G_k^T with G_k = -R_kk^-1 R_kn.
+
+    Parameters
+    ----------
+    chain : Chain
+        Whitened rows.
+    covariance : bool
+        Give `covariance` and `lag_one`.
+    filtered : bool
+        Give the forward estimates too.
+    gate : float, optional
+        Leave out an epoch's observations if their NIS is less likely than this, e.g. 1e-4 (rail 17); none by default.
+    allow_breaks : bool
+        Accept a link that couples nothing, as long as each part is determined by its own rows.
+
+    Returns
+    -------
+    ChainSolution
+        States, covariances, NIS; frozen.
+
+    Raises
+    ------
+    EstimationError
+        A link is broken, a state is not determined by the rows, or a row is not finite; the message names the epoch.
+
+    Notes
+    -----
+    Time and store are linear in N; a singular start needs no care: rows that meet an empty pivot fill it (necessary rows). A
+    pivot below 1e-12 of its row counts as empty. Cost, 100,000 epochs on one core: docs/performance.md.
+
+    References
+    ----------
+    Specification rail 5 and 15.1-15.4, equations (16), (22), (23).
+
+    Examples
+    --------
+    >>> chain = Chain(np.ones((1, 1)), [[0.0], [1.1], [1.9]], [[-1.0]], [[1.0]], [[1.0], [1.0]])
+    >>> solution = solve_chain(chain)
+    >>> solution.state.ravel(), solution.covariance.ravel(), round(solution.sum_of_squares, 6)
+    (array([0.0125, 1.025 , 1.9625]), array([0.625, 0.5  , 0.625]), 0.01375)
+    """
+    if chain.lead:
+        raise EstimationError("a stretch that continues a chain (lead = 1) is for ChainFilter.sweep")
+    N, n = len(chain), chain.n
+    triangle = start_triangle(chain.prior, n)
+    sweep = sweep_chain(chain, triangle, store=True, filtered=filtered, gate=gate)
+    if sweep.broken >= 0 and not allow_breaks:
+        raise EstimationError(
+            f"the link between epochs {sweep.broken} and {sweep.broken + 1} couples nothing; "
+            "solve the two parts as chains of their own, or allow_breaks=True"
+        )
+    state = np.empty((N, n))
+    empty = _kernels.smooth_chain_kernel(sweep.records, triangle, state)
+    if (
+        empty >= 0
+        or not np.isfinite(state[0]).all()
+        or not np.isfinite(state[-1]).all()
+        or not np.isfinite(state).all()
+    ):
+        if empty < 0 or not np.isfinite(triangle).all():
+            raise EstimationError(chain.blame())
+        raise EstimationError(_undetermined(chain, *divmod(empty, n)))
+    P = C = None
+    if covariance:
+        P, C = np.empty((N, n, n)), np.empty((N - 1, n, n))
+        _kernels.covariance_chain_kernel(sweep.records, triangle, P, C)
+    return ChainSolution(
+        state=state,
+        covariance=P,
+        lag_one=C,
+        filtered=sweep.filtered if filtered else None,
+        nis=sweep.nis,
+        dof=sweep.dof,
+        rejected=sweep.rejected,
+        coupling_nis=sweep.coupling_nis,
+        coupling_dof=sweep.coupling_dof,
+        records=sweep.records,
+        triangle=triangle,
+    )
+
+
+@dataclass(slots=True)
+class Sweep:
+    """What one forward sweep leaves; inside this room only."""
+
+    records: FloatArray
+    nis: FloatArray
+    dof: IntArray
+    rejected: BoolArray
+    coupling_nis: FloatArray
+    coupling_dof: IntArray
+    filtered: FloatArray
+    broken: int
+
+
+def sweep_chain(chain: Chain, triangle: FloatArray, *, store: bool, filtered: bool, gate: float | None) -> Sweep:
+    """Run the forward kernel over a chain or a stretch of one; `triangle` is overwritten. Inside this room only."""
+    N, n, links, m = len(chain), chain.n, len(chain.coupling_counts), chain.z.shape[1]
+    limits = np.empty(0) if gate is None else np.array([np.inf, *(chi_square_limit(i + 1, gate) for i in range(m))])
+    out = Sweep(
+        records=np.empty((links if store else 0, n, 2 * n + 1)),
+        nis=np.empty(N),
+        dof=np.empty(N, np.int64),
+        rejected=np.empty(N, np.bool_),
+        coupling_nis=np.empty(links),
+        coupling_dof=np.empty(links, np.int64),
+        filtered=np.empty((N if filtered else 0, n)),
+        broken=-1,
+    )
+    forward = _kernels.forward_kernel(n if n in SPECIALISED_SIZES else 0)
+    out.broken = forward(
+        chain.H, chain.z, chain.counts, chain.M, chain.L, chain.u, chain.coupling_counts, chain.lead, triangle, limits,
+        out.records, out.nis, out.dof, out.rejected, out.coupling_nis, out.coupling_dof, out.filtered,
+    )  # fmt: skip
+    return out
+
+
+def _undetermined(chain: Chain, epoch: int, component: int) -> str:
+    fixes = np.flatnonzero(chain.counts > 0)
+    seen = (
+        f"the first of {len(fixes)} epochs with observations is {fixes[0]}" if len(fixes) else "there is no observation"
+    )
+    return (
+        f"epoch {epoch}: component {component} of the state is not determined by the rows ({seen}); "
+        "add observations, couplings or a prior"
+    )
+
+
+def start_triangle(prior: tuple[ArrayLike, ArrayLike] | None, n: int) -> FloatArray:
+    """Triangle [R | b] of the prior rows, empty without; inside this room only."""
+    triangle = np.zeros((n, n + 1))
+    if prior is not None:
+        R0, b0 = np.asarray(prior[0], np.float64), np.asarray(prior[1], np.float64)
+        _kernels.insert_rows_kernel(triangle, np.ascontiguousarray(np.column_stack([R0, b0])), len(R0))
+    return triangle
+
+
+def prior_rows(prior: tuple[ArrayLike, ArrayLike], n: int) -> tuple[FloatArray, FloatArray]:
+    """Prior rows, checked; inside this room only."""
+    R0, b0 = as_floats("prior", prior[0]), as_floats("prior", prior[1])
+    if R0.ndim != 2 or R0.shape[1] != n or b0.shape != (len(R0),):
+        raise EstimationError(f"prior has shapes {R0.shape} and {b0.shape}; (r, {n}) and (r,) fit")
+    if not np.isfinite(R0).all() or not np.isfinite(b0).all():
+        raise EstimationError("prior is not finite; leave out what is not known")
+    return R0, b0
+
+
+def as_floats(name: str, value: ArrayLike) -> FloatArray:
+    """Contiguous float64 array of an argument, or an error that names it; inside this room only."""
+    try:
+        return np.ascontiguousarray(value, dtype=np.float64) if np.ndim(value) else np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise EstimationError(f"{name} is not an array of numbers: {error}") from None
+
+
+def _stack(name: str, value: ArrayLike, length: int, rows: int, n: int | None) -> FloatArray:
+    out = as_floats(name, value)
+    if out.ndim == 2:
+        out = out[np.newaxis]
+    if out.ndim != 3 or out.shape[1] != rows or len(out) not in (1, length) or n not in (None, out.shape[2]):
+        shape = f"({length}, {rows}, {'n' if n is None else n})"
+        raise EstimationError(f"{name} has shape {np.shape(value)}; {shape} fits the right-hand sides")
+    return out
+
+
+def _counts(name: str, value: ArrayLike | None, length: int, most: int) -> IntArray:
+    if value is None:
+        return np.full(length, most, np.int64)
+    out = np.asarray(value)
+    if out.shape != (length,) or (out.size and not np.issubdtype(out.dtype, np.integer)):
+        raise EstimationError(f"{name} has shape {out.shape} and type {out.dtype}; ({length},) integers fit")
+    if out.size and (out.min() < 0 or out.max() > most):
+        raise EstimationError(f"{name} runs from {out.min()} to {out.max()}; there are 0 to {most} rows")
+    return np.ascontiguousarray(out, np.int64)
