@@ -145,6 +145,7 @@ def read_run(folder: str | Path) -> Run:
     folder = Path(folder)
     contents = _read_contents(folder)
     file = folder / CONTENTS
+    start = _start(contents.run.start, file)
     tables: dict[str, Table] = {}
     for name in STREAMS:
         stream: _Stream | None = getattr(contents, name)
@@ -156,7 +157,7 @@ def read_run(folder: str | Path) -> Run:
     time = {name: _time(table, getattr(contents, name).time_offset_s) for name, table in tables.items()}
     return Run(
         id=contents.run.id,
-        start=_start(contents.run.start, file),
+        start=start,
         direction=contents.run.direction,
         gnss=_gnss(tables["gnss"], time["gnss"], contents.gnss) if contents.gnss else None,
         imu=_imu(tables["imu"], time["imu"], contents.imu) if contents.imu else None,

@@ -259,7 +259,7 @@ def _check_file(path: Path, error: type[InputError]) -> None:
 
 def _missing(path: Path, name: str, found: Sequence[str], error: type[InputError], hint: str = "") -> InputError:
     listed = ", ".join(found[:20]) + (", ..." if len(found) > 20 else "")
-    remedy = hint or f"the file has: {_shown(listed, 300)}"
+    remedy = hint or f"the file has: {_shown(listed, 300)[1:-1]}"
     return error("required column is missing", file=path, column=name, remedy=remedy)
 
 
