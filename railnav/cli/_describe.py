@@ -13,6 +13,14 @@ if TYPE_CHECKING:
     from railnav.track.model import TrackModel
     from railnav.truth import Truth
 
+_NODES = {
+    "joint": ("joint", "joints"),
+    "turnout": ("turnout", "turnouts"),
+    "crossing": ("crossing", "crossings"),
+    "buffer_stop": ("buffer stop", "buffer stops"),
+    "end_of_model": ("end of the model", "ends of the model"),
+}
+
 
 def describe_model(model: TrackModel) -> dict[str, Any]:
     """Describe a model: tracks, nodes by kind, movements, plane and pinned operation, accuracy, provenance.
@@ -66,6 +74,14 @@ def describe_model(model: TrackModel) -> dict[str, Any]:
     }
 
 
+def _accuracy(accuracy: float) -> str:
+    return f"accurate to {words.length(accuracy, 2)}" if accuracy > 0 else "exact, no datum shift"
+
+
+def _radius_words(radius: float | None) -> str:
+    return words.length(radius) if radius is not None and radius < 2e4 else "straight"
+
+
 def _radius(curvature: float) -> float | None:
     return 1.0 / curvature if curvature > 1e-6 else None
 
@@ -88,11 +104,11 @@ def print_model(facts: dict[str, Any], title: str) -> None:
         title,
         {
             "tracks": f"{len(facts['tracks'])}, together {words.length(facts['length_m'], 5)} ({facts['knots']:,} knots)",
-            "nodes": ", ".join(words.count(n, kind.replace("_", " ")) for kind, n in kinds.items()),
+            "nodes": ", ".join(words.count(n, *_NODES.get(kind, (kind, ""))) for kind, n in kinds.items()),
             "movements": f"{facts['movements']} permitted",
             "mileposts": facts["mileposts"] or "",
             "plane": facts["crs"],
-            "transformation": f"{facts['operation']} (accuracy {words.length(facts['operation_accuracy_m'], 2)})",
+            "transformation": f"{facts['operation']} ({_accuracy(facts['operation_accuracy_m'])})",
             "made by": _maker(provenance),
         },
     )
@@ -105,7 +121,7 @@ def print_model(facts: dict[str, Any], title: str) -> None:
                 track["line"],
                 track["name"],
                 words.exact_length(track["length_m"]),
-                words.length(track["tightest_radius_m"]),
+                _radius_words(track["tightest_radius_m"]),
                 words.length(track["sigma_cross_m"], 2),
                 words.length(track["sigma_cross_95_m"], 2),
                 "yes" if track["heights"] else "no",

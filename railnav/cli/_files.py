@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sqlite3
 from collections.abc import Iterable, Sequence
+from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -133,7 +134,11 @@ def kind_of(path: Path) -> Kind:
     if ending in (".geojson", ".json"):
         with path.open("rb") as file:
             head = file.read(65536)
-        return "solution" if b'"Point"' in head and b'"LineString"' not in head else "model"
+        return (
+            "solution"
+            if b'"LineString"' not in head and (b'"Point"' in head or b'"sigma_along_m"' in head)
+            else "model"
+        )
     if ending in (".csv", ".parquet"):
         names = _columns(path)
         if {"track", "offset_m", "heading_deg"} <= names and "mode" not in names:
@@ -158,21 +163,15 @@ def _columns(path: Path) -> set[str]:
 
 
 def _kind_of_geopackage(path: Path) -> Kind:
-    """Tell a solution's GeoPackage from a model's by the column `mode` of its only feature table."""
+    """Tell a solution's GeoPackage from a model's by what it says it holds; foreign files are left to the model's reader."""
+    from railnav.io.container import META
+
     try:
-        connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
-        try:
-            tables = [row[0] for row in connection.execute("SELECT table_name FROM gpkg_contents")]
-            solution = any(
-                {"mode", "sigma_along_m"}
-                <= {row[0] for row in connection.execute("SELECT name FROM pragma_table_info(?)", (table,))}
-                for table in tables
-            )
-        finally:
-            connection.close()
-    except sqlite3.Error as error:
-        raise InputError(f"not a GeoPackage ({error})", file=path) from error
-    return "solution" if solution else "model"
+        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as connection:
+            row = connection.execute(f"SELECT value FROM {META} WHERE key = 'content'").fetchone()  # noqa: S608 - a constant
+    except sqlite3.Error:
+        return "model"
+    return "solution" if row and "solution" in str(row[0]) else "model"
 
 
 def read_model(path: Path) -> TrackModel:

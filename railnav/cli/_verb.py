@@ -11,7 +11,7 @@ import click
 F = TypeVar("F", bound=Callable[..., Any])
 
 #: A path on the command line. Existence is checked where the file is read, so that a missing file is one line and exit code 1.
-PATH: Any = click.Path(path_type=Path)
+PATH: Any = click.Path(path_type=Path, readable=False)
 
 
 class Failure(click.ClickException):

@@ -24,7 +24,7 @@ def command(ctx: click.Context, file: Path, as_json: bool) -> None:
       railnav validate demo/line.gpkg
     """  # noqa: D301
     from railnav.cli import _files
-    from railnav.cli._terminal import print_json, print_table
+    from railnav.cli._terminal import print_json
     from railnav.errors import InputError
     from railnav.web import words
 
@@ -47,7 +47,9 @@ def command(ctx: click.Context, file: Path, as_json: bool) -> None:
             }
         )
     elif defects:
-        print_table(f"{file}: {words.count(len(defects), 'defect')}", ("defect", "where", "what"), defects, left=3)
+        click.secho(f"{file}: {words.count(len(defects), 'defect')}", bold=True)
+        for what, where, detail in defects:
+            click.echo(f"  {what}: {where}: {detail}")
     else:
         click.echo(f"{file}: no defects found ({kind})")
     if defects:

@@ -331,7 +331,13 @@ def _path(solution: Solution, east0: float, north0: float) -> list[dict[str, Any
     return traces
 
 
-def along_time(solution: Solution, evaluation: Evaluation | None = None, truth: Truth | None = None) -> Figure:
+def along_time(
+    solution: Solution,
+    evaluation: Evaluation | None = None,
+    truth: Truth | None = None,
+    *,
+    shaded: Sequence[tuple[float, float]] = (),
+) -> Figure:
     """Draw speed, error, uncertainty and mode along time, one chart above another on one time axis.
 
     Parameters
@@ -341,6 +347,8 @@ def along_time(solution: Solution, evaluation: Evaluation | None = None, truth: 
         Without it the second chart shows what the solution says of itself: sigma and protection level.
     truth : Truth, optional
         Adds the true speed.
+    shaded : sequence of (from, to)
+        Times to shade, s: where GNSS was silent.
 
     Returns
     -------
@@ -396,6 +404,7 @@ def along_time(solution: Solution, evaluation: Evaluation | None = None, truth: 
         yaxis2=_axis("along the track, m", domain=[0.13, 0.6], range=_reach(scale)),
         yaxis3=_axis("mode", domain=[0.0, 0.06], range=[0, 1], showticklabels=False, ticks="", showgrid=False),
     )
+    layout["shapes"] = [_shade(a / 60.0, b / 60.0) for a, b in shaded]
     return Figure("time", data, layout, moves=True)
 
 
@@ -459,7 +468,13 @@ def _mode_ribbon(solution: Solution, minutes: FloatArray) -> list[dict[str, Any]
     return traces
 
 
-def along_line(solution: Solution, evaluation: Evaluation | None, model: TrackModel | None) -> Figure:
+def along_line(
+    solution: Solution,
+    evaluation: Evaluation | None,
+    model: TrackModel | None,
+    *,
+    shaded: Sequence[tuple[float, float]] = (),
+) -> Figure:
     """Draw error and uncertainty along the line, above the line's own curvature and height.
 
     Parameters
@@ -467,6 +482,9 @@ def along_line(solution: Solution, evaluation: Evaluation | None, model: TrackMo
     solution : Solution
     evaluation : Evaluation, optional
     model : TrackModel, optional
+        Adds curvature and height of the track under the train.
+    shaded : sequence of (from, to)
+        Times to shade, s: where GNSS was silent.
 
     Returns
     -------
@@ -525,7 +543,85 @@ def along_line(solution: Solution, evaluation: Evaluation | None, model: TrackMo
         )
         layout["yaxis2"] = _axis("curvature, 1/km", domain=[0.26, 0.46])
         layout["yaxis3"] = _axis("height, m", domain=[0.0, 0.2])
+    spans = np.interp(np.asarray(shaded, dtype=np.float64).reshape(-1, 2), solution.time, distance)
+    layout["shapes"] = [_shade(float(a), float(b)) for a, b in spans]
     return Figure("line", data, layout)
+
+
+def _shade(begin: float, end: float) -> dict[str, Any]:
+    """A grey stretch behind all charts of a figure."""
+    return {
+        "type": "rect",
+        "layer": "below",
+        "xref": "x",
+        "yref": "paper",
+        "x0": begin,
+        "x1": end,
+        "y0": 0,
+        "y1": 1,
+        "line": {"width": 0},
+        "fillcolor": "rgba(93,107,118,0.12)",
+    }
+
+
+def which_track(solution: Solution, truth: Truth | None = None, *, at_most: int = 60) -> Figure:
+    """Draw the tracks in the order run, as the solution has them and as they were.
+
+    Parameters
+    ----------
+    solution : Solution
+    truth : Truth, optional
+    at_most : int
+        Greatest number of tracks to name; the rest is left out.
+
+    Returns
+    -------
+    Figure
+        x is minutes since the run's start; one row a track.
+    """
+    names: dict[str, None] = {}
+    data = []
+    for label, source, colour, width in (
+        ("as it was", truth, "#c9d1d6", 11),
+        ("as navigated", solution, ESTIMATE, 3.5),
+    ):
+        if source is None:
+            continue
+        x: list[float | None] = []
+        y: list[str | None] = []
+        for value, a, b in _runs_of(source.track):
+            if value < 0:
+                continue
+            name = source.track_id[value]
+            if name not in names and len(names) >= at_most:
+                continue
+            names[name] = None
+            x += [float(source.time[a]) / 60.0, float(source.time[min(b, len(source.time) - 1)]) / 60.0, None]
+            y += [escape(name), escape(name), None]
+        data.append(
+            _line(
+                label,
+                x,
+                y,
+                colour,
+                line={"width": width},
+                connectgaps=False,
+                hovertemplate=f"%{{y}}<extra>{label}</extra>",
+            )
+        )
+    layout = _layout(
+        110 + 24 * max(len(names), 2),
+        hovermode="closest",
+        xaxis=_axis("minutes since the start of the run"),
+        yaxis=_axis(
+            "",
+            type="category",
+            categoryorder="array",
+            categoryarray=[escape(name) for name in names],
+            autorange="reversed",
+        ),
+    )
+    return Figure("tracks", data, layout, moves=True)
 
 
 def _geometry(model: TrackModel, solution: Solution, rows: IntArray) -> Any:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from railnav.errors import RailnavError
-from railnav.web import words
 from railnav.web.figures import INK, MODE_COLOURS, SOFT, TRACK, cross_sigma, distance_run, outline
 
 if TYPE_CHECKING:
@@ -159,8 +158,7 @@ def _draw_profile(axes: Axes, model: TrackModel) -> None:
     """Height along the longest track; where there are no heights, its cross-track standard deviation."""
     longest = int(np.argmax(model.lengths))
     knots = slice(int(model.knot_start[longest]), int(model.knot_start[longest + 1]))
-    name = f"{model.track_id[longest]}, {words.length(float(model.lengths[longest]))}"
-    axes.set_xlabel(f"offset on track {name}, km")
+    axes.set_xlabel(f"km along {model.track_id[longest]}, the longest track")
     if np.isfinite(model.height[knots]).any():
         axes.plot(model.offset[knots] / 1e3, model.height[knots], color=INK, linewidth=1.4)
         axes.set_ylabel("height, m")
