@@ -17,7 +17,7 @@ from railnav.geodesy.ellipsoid import (
     WGS84,
     Ellipsoid,
 )
-from railnav.geodesy.grid import GridFrame, choose_frame
+from railnav.geodesy.grid import GridFrame, choose_frame, frame_for_grid
 from railnav.geodesy.transformation import GeodeticFrame, geodetic_frame
 
 __all__ = [
@@ -32,5 +32,6 @@ __all__ = [
     "GeodeticFrame",
     "GridFrame",
     "choose_frame",
+    "frame_for_grid",
     "geodetic_frame",
 ]

@@ -415,6 +415,64 @@ def choose_frame(
     return _pin(_read_crs(f"EPSG:{code}"), extent, asked=f"EPSG:{code}")
 
 
+def frame_for_grid(easting: ArrayLike, northing: ArrayLike, *, crs: Any) -> GridFrame:
+    """Pin the transformation of a plane in which coordinates are given already.
+
+    Parameters
+    ----------
+    easting, northing : float or array
+        Where the data lies, in that plane, m.
+    crs : str or pyproj.CRS
+        The plane, as for `choose_frame`; "gk6" and "gk3" read the zone from the false easting, int(easting/1e6).
+
+    Returns
+    -------
+    GridFrame
+        The plane with its pinned transformation.
+
+    Raises
+    ------
+    CrsError
+        As for `choose_frame`; also coordinates that are not of that plane.
+
+    Examples
+    --------
+    >>> frame_for_grid(3462825.3, 5481774.8, crs="EPSG:31467").name
+    'DHDN / 3-degree Gauss-Kruger zone 3'
+    >>> frame_for_grid(4462825.3, 5481774.8, crs="gk6").name
+    'WGS 84 / Gauss-Kruger zone 4'
+    """
+    from pyproj import Proj
+
+    east, north = (v.ravel() for v in _broadcast(easting, northing))
+    _refuse_not_finite(east, north)
+    if len(east) == 0:
+        raise CrsError("no coordinates to place a plane by; give at least one")
+    if isinstance(crs, str) and crs.strip().lower() in {"gk3", "gk6"}:
+        width = int(crs.strip()[2])
+        zone = int(np.median(east) // 1e6)
+        if not (0 if width == 3 else 1) <= zone <= 360 // width:
+            raise CrsError(
+                f"easting {np.median(east):.0f} has no Gauss-Krueger zone in front; name the plane by its EPSG code"
+            )
+        system = _gauss_krueger_wgs84(float(6 * zone - 3 if width == 6 else 3 * zone), width)
+    else:
+        system = _read_crs(crs)
+    plain = system.source_crs if system.is_bound and system.source_crs is not None else system
+    # the datum's own latitude and longitude: within some 200 m of those of WGS 84, near enough to choose by
+    proj = Proj(plain)
+    lon, lat = proj(east, north, inverse=True)
+    again = np.hypot(*(np.subtract(a, b) for a, b in zip(proj(lon, lat), (east, north), strict=True)))
+    bad = ~(np.abs(lat) <= 90.0) | ~(again < 1.0)
+    if bad.any():
+        i = int(np.argmax(bad))
+        raise CrsError(
+            f"coordinates {i + 1} (easting {east[i]:.0f}, northing {north[i]:.0f}) do not lie in {_label(system, crs)}; "
+            "check the plane, and that easting and northing are not exchanged"
+        )
+    return _pin(system, Extent.of(np.radians(lat), np.radians(lon)), asked=str(crs))
+
+
 def _zone_6(longitude_deg: float) -> int:
     return int((longitude_deg % 360.0) // 6.0) + 1
 

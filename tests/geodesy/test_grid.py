@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from railnav.errors import CrsError
-from railnav.geodesy import BESSEL, WGS84, GridFrame, choose_frame
+from railnav.geodesy import BESSEL, WGS84, GridFrame, choose_frame, frame_for_grid
 from railnav.geodesy.grid import _PULKOVO
 from railnav.geodesy.projection import Projection, projection_of
 
@@ -407,6 +407,31 @@ def test_refusals(place, options, words):
         choose_frame(*place, **options)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_plane_for_coordinates_that_are_in_it_already(frame_and_place):
+    frame, place = frame_and_place
+    easting, northing, _ = frame.to_grid(*scatter(place, n=20))
+    again = frame_for_grid(easting, northing, crs=frame.crs_wkt)
+    assert (again.pipeline, again.accuracy) == (frame.pipeline, frame.accuracy)
+    if frame.name.startswith("WGS 84 /") and "Gauss" in frame.name:
+        assert frame_for_grid(easting, northing, crs="gk3" if "3-degree" in frame.name else "gk6") == frame
+
+
+@pytest.mark.parametrize(
+    ("easting", "northing", "crs", "words"),
+    [
+        (650_000.0, 240_000.0, "gk6", "has no Gauss-Krueger zone in front"),
+        (5_481_774.8, 3_462_825.3, "EPSG:31467", "outside the area of use"),
+        (650_000.0, 240_000.0, "EPSG:4326", "not a projected"),
+        (np.empty(0), np.empty(0), "EPSG:31467", "at least one"),
+        (np.nan, 0.0, "EPSG:31467", "not finite"),
+        (1e9, 1e9, "EPSG:2056", "do not lie in"),
+    ],
+)
+def test_coordinates_of_another_plane(easting, northing, crs, words):
+    with pytest.raises(CrsError, match=words):
+        frame_for_grid(easting, northing, crs=crs)
 
 
 def test_positions_that_cannot_be_projected_are_named():
