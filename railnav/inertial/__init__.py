@@ -1,0 +1,25 @@
+"""Inertial sensors and what can be made of them alone: error models, noise analysis.
+
+Body axes b are forward, right, down; local axes n are north, east, down. `specific_force_b` is what an accelerometer measures,
+acceleration minus gravitation: at rest it points up with the size of gravity, so its third component is about -9.81 m/s^2 on a
+level vehicle. `rate_ib_b` is what a gyro measures, the rate against inertial space, rad/s. All values are means over the interval that
+ends at their time, as in `railnav.run.ImuStream`.
+"""
+
+from __future__ import annotations
+
+from railnav.inertial.allan import AllanCurve, NoiseParameters, allan_deviation, fit_allan
+from railnav.inertial.sensors import GRADES, SensorGrade, TriadModel, TriadSamples, misalignment_matrix, simulate_triad
+
+__all__ = [
+    "GRADES",
+    "AllanCurve",
+    "NoiseParameters",
+    "SensorGrade",
+    "TriadModel",
+    "TriadSamples",
+    "allan_deviation",
+    "fit_allan",
+    "misalignment_matrix",
+    "simulate_triad",
+]
