@@ -204,7 +204,7 @@ def demo_line(*, spacing: float = 1.0, frame: GridFrame | None = None) -> TrackM
     Notes
     -----
     Main tracks exactly 4.0 m apart on the ground; turnouts 1:9 R=300 m (station) and 1:12 R=500 m (line and branch), whose
-    branches leave and arrive tangentially; steps of curvature run over 2 m. 54,000 knots in about half a second.
+    branches leave and arrive tangentially; steps of curvature run over 2 m. 57,000 knots in about 0.4 s.
 
     Examples
     --------
@@ -256,6 +256,7 @@ def demo_line(*, spacing: float = 1.0, frame: GridFrame | None = None) -> TrackM
         [piece.section for piece in [*mains, *others]] + [branch],
         provenance={
             "source": "railnav.simulation.demo_line: a fictitious line, laid out from alignment elements",
+            "simulated": True,
             "licence": "Apache-2.0",
             "tunnels": _tunnels(mains),
         },

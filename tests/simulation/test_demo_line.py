@@ -133,3 +133,17 @@ def test_lengths_do_not_depend_on_the_plane():
     other = demo_line(spacing=10.0, frame=choose_frame(math.radians(50.6), math.radians(10.9), crs="EPSG:25832"))
     assert other.frame.name != wide.frame.name
     np.testing.assert_allclose(other.lengths, wide.lengths, rtol=2e-7)
+
+
+def test_script_writes_the_same_line(line: TrackModel, tmp_path):
+    import runpy
+    from pathlib import Path
+
+    script = Path(__file__).parents[2] / "track_models" / "make_demo_line.py"
+    runpy.run_path(str(script))["main"](tmp_path / "line.gpkg")
+    back = TrackModel.read(tmp_path / "line.gpkg")
+    assert back.track_id == line.track_id
+    assert back.provenance["tunnels"] == line.provenance["tunnels"]
+    np.testing.assert_allclose(back.easting, line.easting, atol=1e-6)
+    np.testing.assert_allclose(back.offset, line.offset, atol=1e-6)
+    assert validate(back) == []
