@@ -8,6 +8,7 @@ from railnav.cli._terminal import print_facts, print_table
 from railnav.web import words
 
 if TYPE_CHECKING:
+    from railnav.evaluation import Evaluation
     from railnav.navigation.solution import Solution
     from railnav.run import Run
     from railnav.track.model import TrackModel
@@ -326,3 +327,43 @@ def print_build(model: TrackModel, title: str) -> None:
     for name, (columns, rows, left) in (("Runs", report.run_rows(build)), ("Tracks", report.track_rows(build))):
         print_table(name, columns, rows, left=left)
     print_warnings(build.get("warnings", []))
+
+
+def print_evaluation(evaluation: Evaluation, title: str) -> None:
+    """Print how good a solution is, and whether it knows."""
+    from railnav.web import report
+
+    selection, integrity, found = evaluation.selection, evaluation.integrity, evaluation.consistency
+    along, across, speed = evaluation.along_statistics, evaluation.across_statistics, evaluation.speed_statistics
+    nees = ""
+    if found.nees is not None and found.lower is not None and found.upper is not None:
+        verdict = "inside" if found.inside else "OUTSIDE"
+        nees = (
+            f"{found.nees:.2f}, {verdict} {found.lower:.2f} to {found.upper:.2f} "
+            f"({words.figures(found.effective, 2)} independent samples)"
+        )
+    jumps = ""
+    if evaluation.jumps is not None:
+        jumps = f"{len(evaluation.jumps.illegal)} illegal of {evaluation.jumps.changes} changes of track"
+    print_facts(
+        title,
+        {
+            "epochs": f"{evaluation.epochs:,}, {words.share(evaluation.availability)} with a position",
+            "right track": f"{words.share(selection.rate)} (compared by {selection.compared_by}); "
+            f"{selection.wrong_while_tracking} epochs sure of a wrong one",
+            "error along": f"{words.length(along.rms)} RMS, {words.length(along.p95)} at 95 %, {words.length(along.max)} at worst",
+            "error across": f"{words.length(across.rms)} RMS, {words.length(across.max)} at worst",
+            "error of speed": f"{words.figures(speed.rms)} m/s RMS",
+            "NEES along": nees,
+            "integrity": f"{integrity.events} of {integrity.rows:,} epochs beyond their bound "
+            f"(median {words.length(integrity.median_level)}, risk {integrity.integrity_risk:g}), "
+            f"{integrity.hazardous} hazardous at an alert limit of {words.length(integrity.alert_limit)}",
+            "jumps": jumps,
+        },
+    )
+    for name, (columns, rows, left) in (
+        ("Errors along by mode", report.mode_rows(evaluation)),
+        ("Without GNSS", report.coasting_rows(evaluation)),
+        ("On a wrong track", report.wrong_rows(evaluation)),
+    ):
+        print_table(name, columns, rows, left=left)

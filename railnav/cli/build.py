@@ -13,7 +13,13 @@ from railnav.cli._verb import PATH, crs_options, json_option
 @click.argument("runs", type=PATH, nargs=-1, required=True, metavar="RUN...")
 @click.option("-o", "--output", type=PATH, required=True, help="Model to write, .gpkg (or .geojson).")
 @crs_options
-@click.option("--spacing", type=click.FloatRange(0, min_open=True), default=1.0, show_default=True, help="Knots, m.")
+@click.option(
+    "--spacing",
+    type=click.FloatRange(0, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="Distance between knots, m.",
+)
 @click.option("--report", type=PATH, help="Also write a page about the build, .html.")
 @json_option
 def command(

@@ -58,6 +58,163 @@ def command(output: Path, seed: int, as_json: bool) -> None:
         click.echo(f"  {line}")
 
 
+@contextmanager
+def _staging(output: Path) -> Iterator[Path]:
+    """Lend a folder that becomes the output when all is done; a demo's older folder gives way then, not before."""
+    import shutil
+    import tempfile
+
+    target = output.resolve()
+    draft = Path(tempfile.mkdtemp(prefix=".railnav-demo-", suffix=".partial", dir=target.parent))
+    try:
+        yield draft
+        draft.chmod(0o755)
+        if target.exists():
+            old = draft.with_suffix(".old")
+            target.rename(old)
+            draft.rename(target)
+            shutil.rmtree(old, ignore_errors=True)
+        else:
+            draft.rename(target)
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+class _Watch:
+    """Wall time of each step, s."""
+
+    def __init__(self) -> None:
+        self.steps: list[tuple[str, float]] = []
+        self._last = time.perf_counter()
+
+    def done(self, step: str) -> None:
+        now = time.perf_counter()
+        self.steps.append((step, now - self._last))
+        self._last = now
+
+
+def _demo(folder: Path, shown: Path, seed: int, tell: Progress | None) -> tuple[dict[str, Any], list[str]]:
+    """Go the whole way in a folder; returns facts for JSON, and lines for people."""
+    from dataclasses import replace
+
+    from railnav.evaluation import evaluate
+    from railnav.io.geojson import write_geojson
+    from railnav.io.run import write_run
+    from railnav.io.truth import write_truth
+    from railnav.navigation import navigate
+    from railnav.survey import build
+    from railnav.web.report import demo_page, evaluation_words
+
+    watch = _Watch()
+    reference, surveys, service, truth = _simulated(seed, tell)
+    watch.done("simulate the survey and the service run")
+    reference.to_file(folder / "bundled.gpkg")
+    for survey in surveys:
+        write_run(survey, folder / survey.id)
+    write_run(service, folder / service.id)
+    write_truth(truth, folder / "truth.csv")
+    watch.done("write them in the formats of the files")
+    model = build(surveys, progress=tell)
+    model = replace(model, provenance={**model.provenance, "simulated": True})
+    watch.done("build the reference track model")
+    model.to_file(folder / "line.gpkg")
+    write_geojson(model, folder / "line.geojson")
+    watch.done("write the model")
+    solution = navigate(service, model, progress=tell)
+    watch.done("navigate, as if live")
+    smoothed = navigate(service, model, smooth=True, progress=tell)
+    watch.done("navigate again, smoothed")
+    solution.to_file(folder / "solution.gpkg")
+    smoothed.to_file(folder / "smoothed.csv")
+    evaluation, evaluation_smoothed = evaluate(solution, truth, model=model), evaluate(smoothed, truth, model=model)
+    watch.done("evaluate")
+    axis = _axis_error(model, reference)
+    page = demo_page(
+        model=model,
+        surveys=surveys,
+        service=service,
+        solution=solution,
+        truth=truth,
+        evaluation=evaluation,
+        smoothed=evaluation_smoothed,
+        axis_error=axis,
+        steps=watch.steps,
+        commands=next_commands(shown),
+        seed=seed,
+    )
+    (folder / REPORT).write_text(page, encoding="utf-8")
+    facts = {
+        "simulated": True,
+        "seed": seed,
+        "folder": shown,
+        "report": shown / REPORT,
+        "model": {"tracks": len(model.track_id), "length_m": float(model.lengths.sum()), **axis},
+        "evaluation": evaluation.to_dict(),
+        "evaluation_smoothed": evaluation_smoothed.to_dict(),
+        "steps_s": {name: round(seconds, 2) for name, seconds in watch.steps},
+    }
+    return facts, evaluation_words(evaluation)
+
+
+def _simulated(seed: int, tell: Progress | None) -> tuple[TrackModel, list[Run], Run, Truth]:
+    """Simulate survey passes over both main tracks of the bundled line, and a train in service."""
+    import numpy as np
+
+    from railnav.simulation import SERVICE, SURVEY, Leg, Stop, demo_line, simulate
+
+    reference = demo_line()
+    right = tuple(sorted(track for track in reference.track_id if track.startswith("77R-")))
+    left = tuple(sorted((track for track in reference.track_id if track.startswith("77L-")), reverse=True))
+    seeds = [int(number) for number in np.random.SeedSequence(seed).generate_state(2 * PASSES + 1)]
+    surveys = []
+    for number in range(2 * PASSES):
+        up = number % 2 == 0
+        last = reference.length(right[-1]) - 20.0
+        leg = (
+            Leg(right, start=20.0, finish=last)
+            if up
+            else Leg(left, start=reference.length(left[0]) - 20.0, finish=20.0)
+        )
+        run, _ = simulate(
+            reference,
+            leg,
+            seed=seeds[number],
+            outfit=SURVEY,
+            run_id=f"survey-{number + 1}",
+            direction="up" if up else "down",
+            progress=None,
+        )
+        surveys.append(run)
+        if tell:
+            tell("simulate", number + 1, 2 * PASSES + 1)
+    station = next(track for track in right if track == "77R-06")
+    leg = Leg(right, start=60.0, finish=reference.length(right[-1]) - 60.0, stops=(Stop(station, 700.0, 45.0),))
+    service, truth = simulate(reference, leg, seed=seeds[-1], outfit=SERVICE, run_id="service", direction="up")
+    if tell:
+        tell("simulate", 2 * PASSES + 1, 2 * PASSES + 1)
+    return reference, surveys, service, truth
+
+
+def _axis_error(model: TrackModel, reference: TrackModel) -> dict[str, float | None]:
+    """How far the built axis lies from the true one, across, every 20 m: RMS and largest, m."""
+    import numpy as np
+
+    latitude, longitude, _ = model.frame.to_geodetic(model.easting, model.northing)
+    easting, northing, _ = reference.frame.to_grid(latitude, longitude)
+    cross = []
+    for track in model.track_id:
+        knots = model.knots(track)
+        for k in range(knots.start, knots.stop, 20):
+            near = reference.locate(float(easting[k]), float(northing[k]), within=1.5)
+            if near:
+                cross.append(near[0].distance)
+    found = np.asarray(cross)
+    return {
+        "axis_rms_m": float(np.sqrt(np.mean(found**2))) if len(found) else None,
+        "axis_max_m": float(found.max()) if len(found) else None,
+    }
+
+
 def next_commands(folder: Path) -> list[str]:
     """Commands that go on from where the demo ends."""
     return [

@@ -13,7 +13,13 @@ from railnav.cli._verb import PATH, crs_options, json_option
 @click.argument("source", type=PATH)
 @click.option("-o", "--output", type=PATH, required=True, help="Model to write, .gpkg.")
 @crs_options
-@click.option("--spacing", type=click.FloatRange(0, min_open=True), default=1.0, show_default=True, help="Knots, m.")
+@click.option(
+    "--spacing",
+    type=click.FloatRange(0, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="Distance between knots, m.",
+)
 @json_option
 def command(
     source: Path,

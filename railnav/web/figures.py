@@ -73,11 +73,12 @@ def thin(limit: int, *series: FloatArray) -> IntArray:
     if m <= limit:
         return np.arange(m)
     stretch = max(1, -(-m * (1 + 2 * len(series)) // limit))
-    whole = m // stretch * stretch
-    first = np.arange(0, whole, stretch)
-    keep = [first, np.arange(whole, m, stretch), np.array([m - 1])]
+    first = np.arange(0, m, stretch)
+    keep = [first, np.array([m - 1])]
     for values in series:
-        table = values[:whole].reshape(-1, stretch)
+        padded = np.full(len(first) * stretch, np.nan)
+        padded[:m] = values
+        table = padded.reshape(-1, stretch)
         keep.append(first + np.argmin(np.where(np.isfinite(table), table, np.inf), axis=1))
         keep.append(first + np.argmax(np.where(np.isfinite(table), table, -np.inf), axis=1))
     return np.unique(np.concatenate(keep))

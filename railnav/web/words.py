@@ -26,7 +26,8 @@ def figures(value: float | None, digits: int = 3) -> str:
         return NOTHING
     if value == 0:
         return "0"
-    decimals = digits - 1 - math.floor(math.log10(abs(value)))
+    rounded = float(f"{value:.{digits - 1}e}")
+    decimals = digits - 1 - math.floor(math.log10(abs(rounded)))
     if decimals > 7:
         return f"{value:.{digits - 1}g}"
     return f"{value:,.{max(decimals, 0)}f}"
@@ -92,10 +93,10 @@ def share(value: float | None) -> str:
     percent = 100 * value
     if percent in (0.0, 100.0):
         return f"{percent:.0f} %"
-    decimals = 2 if percent >= 99 or percent < 1 else 1
-    scale = 10**decimals
-    percent = math.floor(percent * scale) / scale if percent > 50 else math.ceil(percent * scale) / scale
-    return f"{percent:.{decimals}f} %"
+    if 1 <= percent < 99:
+        return f"{percent:.1f} %"
+    percent = math.floor(percent * 100) / 100 if percent > 50 else math.ceil(percent * 100) / 100
+    return f"{percent:.2f} %"
 
 
 def speed(value: float | None) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import math
 import subprocess
@@ -57,7 +58,7 @@ def test_help_of_a_verb_loads_nothing_heavy() -> None:
 def test_every_verb_is_documented(verb: str) -> None:
     command = verb_of(verb)
     assert command.name == verb
-    text = command.help or ""
+    text = inspect.cleandoc(command.help or "")
     assert text.split("\n\n")[0].replace("\n", " ") == VERBS[verb][1], (
         "the short help in VERBS is the first sentence of the long one"
     )
