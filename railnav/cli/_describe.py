@@ -353,7 +353,7 @@ def print_evaluation(evaluation: Evaluation, title: str) -> None:
             f"{selection.wrong_while_tracking} epochs sure of a wrong one",
             "error along": f"{words.length(along.rms)} RMS, {words.length(along.p95)} at 95 %, {words.length(along.max)} at worst",
             "error across": f"{words.length(across.rms)} RMS, {words.length(across.max)} at worst",
-            "error of speed": f"{words.figures(speed.rms)} m/s RMS",
+            "error of speed": f"{words.figures(speed.rms, 2)} m/s RMS",
             "NEES along": nees,
             "integrity": f"{integrity.events} of {integrity.rows:,} epochs beyond their bound "
             f"(median {words.length(integrity.median_level)}, risk {integrity.integrity_risk:g}), "

@@ -2,15 +2,17 @@
 // Draws the figures of the page, and moves the train in the plan while the pointer moves over a chart along time.
 (function () {
   const figures = JSON.parse(document.getElementById("figures").textContent);
+  // The buttons are named one by one: plotly.js has others, some versions one that uploads the chart to its maker.
   const config = {
     responsive: true,
     displaylogo: false,
     showLink: false,
+    showSendToCloud: false,
     showEditInChartStudio: false,
     sendData: false,
     plotlyServerURL: "",
     topojsonURL: "",
-    modeBarButtonsToRemove: ["lasso2d", "select2d", "autoScale2d"],
+    modeBarButtons: [["toImage", "zoom2d", "pan2d", "zoomIn2d", "zoomOut2d", "resetScale2d"]],
     toImageButtonOptions: { format: "svg" },
   };
   const drawn = {};

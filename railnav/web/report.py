@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 SIMULATED = "Simulated data"
-_HOVER = "Move the pointer along the charts below to move the train in the plan; drag to pan, scroll or use the tools to zoom."
+_HOVER = "Move the pointer along the charts below to move the train in the plan; drag it to pan, zoom with the tools at its upper right."
 
 
 def solution_page(solution: Solution, model: TrackModel | None = None) -> str:
@@ -125,7 +125,7 @@ def build_page(model: TrackModel) -> str:
         Card("Plane", model.frame.name, f"transformation to {words.length(model.frame.accuracy, 2)}"),
     ]
     sections = [
-        Section("The line in plan", "Drag to pan, scroll or use the tools to zoom.", [figures.plan(model)]),
+        Section("The line in plan", "Drag to pan, zoom with the tools at the upper right.", [figures.plan(model)]),
         Section(
             "Along the tracks",
             "The legend switches tracks on and off. Curvature is positive to the right as the offset grows.",
@@ -335,7 +335,7 @@ def evaluation_cards(evaluation: Evaluation) -> list[Card]:
             f"{integrity.events:,} of {integrity.rows:,}",
             f"epochs; bound {words.length(integrity.median_level)} in the median, risk {integrity.integrity_risk:g}",
         ),
-        Card("Error of the speed", f"{words.figures(evaluation.speed_statistics.rms)} m/s", "RMS"),
+        Card("Error of the speed", f"{words.figures(evaluation.speed_statistics.rms, 2)} m/s", "RMS"),
     ]
     if coasted is not None:
         cards.append(

@@ -72,8 +72,17 @@ def test_a_page_asks_nothing_of_the_network(line: TrackModel, journey: Journey) 
     rest = text.replace(plotly, "")
     assert "http:" not in rest
     assert "https:" not in rest
-    for phrase in ('plotlyServerURL: ""', 'topojsonURL: ""', "showLink: false", "sendData: false"):
+    for phrase in (
+        'plotlyServerURL: ""',
+        'topojsonURL: ""',
+        "showLink: false",
+        "sendData: false",
+        "showSendToCloud: false",
+    ):
         assert phrase in own
+    assert re.findall(r"modeBarButtons: (.*),\n", own) == [
+        '[["toImage", "zoom2d", "pan2d", "zoomIn2d", "zoomOut2d", "resetScale2d"]]'
+    ], "buttons are named one by one: plotly.js 4 has one that uploads the chart"
     types = {trace["type"] for figure in json.loads(data) for trace in figure["data"]}
     assert types == {"scatter"}, "maps would fetch tiles, WebGL would need eval"
 
