@@ -94,6 +94,17 @@ def test_integrating_the_imu_gives_the_motion_back(line, ride):
     assert abs(float(wrap_angle(math.atan2(c[1, 0], c[0, 0]) - truth.heading[-1]))) < 1e-7
 
 
+def test_it_does_so_against_growing_offset_too(line):
+    leg = Leg(("77R-03",), start=2100.0, finish=1500.0, dwell=1.0)
+    run, truth = simulate(line, leg, seed=1, outfit=Outfit("imu", imu=IDEAL), truth_interval=0.01)
+    points = line.at("77R-03", 2100.0)
+    assert float(points.gradient) > 5e-3
+    out, _ = strapdown(run.imu, truth, -float(cant_angle(points.cant)), -math.atan(float(points.gradient)))
+    assert np.abs(out[:, 2] - truth.height[1:]).max() < 1e-3
+    assert np.abs(out[:, 0] - truth.latitude[1:]).max() * 6.4e6 < 1e-3
+    assert truth.height[-1] < truth.height[0] - 3.0
+
+
 def test_at_rest_it_feels_gravity_and_the_earth(line, ride):
     run, truth = ride
     rest = run.imu.time < 15.0
