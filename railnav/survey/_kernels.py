@@ -1,0 +1,353 @@
+"""Inner loops of the survey room: flat float64 arrays, SI, grid frame, no validation."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+@njit(cache=True)
+def thin(x: FloatArray, y: FloatArray, distance: float) -> NDArray[np.bool_]:
+    """Keep the first point and each that lies `distance` or more from the last one kept."""
+    # x, y (n,) m
+    keep = np.zeros(x.shape[0], np.bool_)
+    if x.shape[0] > 0:
+        keep[0] = True
+    last = 0
+    for i in range(1, x.shape[0]):
+        if (x[i] - x[last]) ** 2 + (y[i] - y[last]) ** 2 >= distance * distance:
+            keep[i] = True
+            last = i
+    return keep
+
+
+@njit(cache=True)
+def foot_on_segment(
+    east: FloatArray, north: FloatArray, te: FloatArray, tn: FloatArray, step: float, j: int, x: float, y: float
+) -> tuple[float, float]:
+    """Foot of (x, y) on the Hermite cubic from node j to j + 1: parameter (may leave 0..1) and signed distance, right positive."""
+    # east, north (m,) nodes, m; te, tn (m,) unit tangents; step: arc length between nodes, m
+    u = 0.0
+    pe, pn, de, dn = east[j], north[j], te[j], tn[j]
+    for k in range(5):
+        if k == 0:
+            u = ((x - east[j]) * te[j] + (y - north[j]) * tn[j]) / step
+        else:
+            u += ((x - pe) * de + (y - pn) * dn) / (step * (de * de + dn * dn))
+        u = min(max(u, -1.0), 2.0)
+        u2, u3 = u * u, u * u * u
+        h00, h10, h01, h11 = 2 * u3 - 3 * u2 + 1, u3 - 2 * u2 + u, -2 * u3 + 3 * u2, u3 - u2
+        g00, g10, g01, g11 = 6 * u2 - 6 * u, 3 * u2 - 4 * u + 1, -6 * u2 + 6 * u, 3 * u2 - 2 * u
+        pe = h00 * east[j] + h10 * step * te[j] + h01 * east[j + 1] + h11 * step * te[j + 1]
+        pn = h00 * north[j] + h10 * step * tn[j] + h01 * north[j + 1] + h11 * step * tn[j + 1]
+        de = (g00 * east[j] + g01 * east[j + 1]) / step + g10 * te[j] + g11 * te[j + 1]
+        dn = (g00 * north[j] + g01 * north[j + 1]) / step + g10 * tn[j] + g11 * tn[j + 1]
+    size = np.sqrt(de * de + dn * dn)
+    return u, ((x - pe) * dn - (y - pn) * de) / size
+
+
+@njit(cache=True)
+def walk(
+    east: FloatArray, north: FloatArray, te: FloatArray, tn: FloatArray, step: float,
+    x: FloatArray, y: FloatArray, limit: float, s: FloatArray, d: FloatArray,
+) -> None:  # fmt: skip
+    """Follow a curve along a run: foot offset s, m, and signed distance d, m, of every fix; NaN where farther than `limit`."""
+    # east, north, te, tn (m,) nodes of the curve every `step` metres; x, y (n,) fixes in time order; s, d (n,) filled
+    m, n = east.shape[0], x.shape[0]
+    last, travelled = -1, 0.0
+    for i in range(n):
+        if i > 0:
+            travelled += np.sqrt((x[i] - x[i - 1]) ** 2 + (y[i] - y[i - 1]) ** 2)
+        low, high = 0, m
+        if last >= 0:
+            reach = int((travelled * 1.2 + 60.0) / step) + 2
+            low, high = max(0, last - reach), min(m, last + reach + 1)
+        best, at = np.inf, -1
+        for j in range(low, high):
+            r = (x[i] - east[j]) ** 2 + (y[i] - north[j]) ** 2
+            if r < best:
+                best, at = r, j
+        s[i] = np.nan
+        d[i] = np.nan
+        if best > (limit + step) ** 2:
+            continue
+        j = min(max(at - 1, 0), m - 2)
+        u, off = foot_on_segment(east, north, te, tn, step, j, x[i], y[i])
+        if u > 1.0 and j < m - 2:
+            u, off = foot_on_segment(east, north, te, tn, step, j + 1, x[i], y[i])
+            j += 1
+        if abs(off) > limit or u < -0.5 or u > 1.5:
+            continue
+        s[i] = (j + u) * step
+        d[i] = off
+        last, travelled = at, 0.0
+
+
+@njit(cache=True)
+def middle(value: FloatArray, apart: float, guess: FloatArray, clumps: IntArray) -> None:
+    """Median of the largest clump of values at every node (gaps above `apart` part clumps; a tie goes to the first row)."""
+    # value (K, N), NaN absent; guess (N,) and clumps (N,) filled: NaN and 0 where nothing is
+    K, N = value.shape
+    v = np.empty(K)
+    for i in range(N):
+        many = 0
+        lead = np.nan
+        for k in range(K):
+            if np.isfinite(value[k, i]):
+                if many == 0:
+                    lead = value[k, i]
+                v[many] = value[k, i]
+                many += 1
+        guess[i] = np.nan
+        clumps[i] = 0
+        if many == 0:
+            continue
+        w = np.sort(v[:many])
+        best, best_a, best_b, has_lead = 0, 0, 0, False
+        a = 0
+        for b in range(1, many + 1):
+            if b == many or w[b] - w[b - 1] > apart:
+                clumps[i] += 1
+                own = w[a] <= lead <= w[b - 1]
+                if b - a > best or (b - a == best and own and not has_lead):
+                    best, best_a, best_b, has_lead = b - a, a, b, own
+                a = b
+        m = (best_a + best_b) // 2
+        guess[i] = w[m] if (best_b - best_a) % 2 == 1 else 0.5 * (w[m - 1] + w[m])
+
+
+@njit(cache=True)
+def reflect_columns(A: FloatArray, rows: int, columns: int) -> None:
+    """Reflect rows 0..rows-1 of A so that its first `columns` columns are upper triangular (Householder, signs left as they fall)."""
+    # A (>= rows, width), overwritten; rows may be fewer than columns
+    width = A.shape[1]
+    for j in range(min(columns, rows)):
+        tail = 0.0
+        for i in range(j + 1, rows):
+            tail += A[i, j] * A[i, j]
+        if tail == 0.0:
+            continue
+        a = A[j, j]
+        norm = np.sqrt(a * a + tail)
+        v = a - norm if a <= 0.0 else -tail / (a + norm)
+        beta = 2.0 * v * v / (tail + v * v)
+        for i in range(j + 1, rows):
+            A[i, j] /= v
+        w = A[j, j + 1 :].copy()
+        for i in range(j + 1, rows):
+            f = A[i, j]
+            if f != 0.0:
+                for c in range(j + 1, width):
+                    w[c - j - 1] += f * A[i, c]
+        for c in range(j + 1, width):
+            A[j, c] -= beta * w[c - j - 1]
+        for i in range(j + 1, rows):
+            f = beta * A[i, j]
+            if f != 0.0:
+                for c in range(j + 1, width):
+                    A[i, c] -= f * w[c - j - 1]
+            A[i, j] = 0.0
+        A[j, j] = norm
+
+
+@njit(cache=True)
+def sweep(
+    step: float, noise: FloatArray, drive: FloatArray, phi: FloatArray, sigma: FloatArray,
+    first: IntArray, who: IntArray, lead: FloatArray, weight: FloatArray, value: FloatArray, design: FloatArray,
+    prior: FloatArray, prior_value: FloatArray, keep: bool,
+    Rkk: FloatArray, Rkn: FloatArray, D: FloatArray, T: FloatArray,
+) -> float:  # fmt: skip
+    """Sweep the bordered chain forward (spec 15.2, 15.6); T gathers the rows left for the border, returns sum ln |R_kk|."""
+    # N nodes, K runs, n = K + 3 states: [error of run 0, ..., error of run K-1, y, y', y'']; b columns: value, then B a run
+    # noise (N-1,) sd of d(curvature)/sqrt(m); drive (N-1,) -d(nominal curvature); phi (N-1, K) memory; sigma (K,) m
+    # first (N+1,) CSR of rows; who (rows,) run; lead (rows,) m from node; weight (rows,) 1/m; value (rows,); design (rows, B)
+    # prior (3,) weights and prior_value (3,) of [y, y', y''] at node 0; Rkk, Rkn (N, n, n), D (N, n, b) filled if keep (else N = 1)
+    N = phi.shape[0] + 1
+    errors = phi.shape[1]
+    n = errors + 3
+    b = T.shape[1]
+    B = design.shape[1]
+    most = 0
+    for k in range(N):
+        most = max(most, first[k + 1] - first[k])
+    A = np.zeros((2 * n, 2 * n + b))
+    C = np.zeros((n + most, n + b))
+    G = np.zeros((b + most, b))
+    logdet = 0.0
+    h = step
+    # W = inverse of the lower Cholesky factor of [[h5/20, h4/8, h3/6], [., h3/3, h2/2], [., ., h]] (curvature random walk)
+    l00 = np.sqrt(h**5 / 20.0)
+    l10 = h**4 / 8.0 / l00
+    l20 = h**3 / 6.0 / l00
+    l11 = np.sqrt(h**3 / 3.0 - l10 * l10)
+    l21 = (h * h / 2.0 - l20 * l10) / l11
+    l22 = np.sqrt(h - l20 * l20 - l21 * l21)
+    W = np.zeros((3, 3))
+    W[0, 0], W[1, 1], W[2, 2] = 1.0 / l00, 1.0 / l11, 1.0 / l22
+    W[1, 0] = -l10 * W[0, 0] / l11
+    W[2, 1] = -l21 * W[1, 1] / l22
+    W[2, 0] = -(l20 * W[0, 0] + l21 * W[1, 0]) / l22
+    F = np.zeros((3, 3))
+    F[0, 0] = F[1, 1] = F[2, 2] = 1.0
+    F[0, 1] = F[1, 2] = h
+    F[0, 2] = 0.5 * h * h
+    WF = W @ F
+    for j in range(errors):
+        C[j, j] = 1.0 / sigma[j]
+    for j in range(3):
+        C[errors + j, errors + j] = prior[j]
+        C[errors + j, n] = prior[j] * prior_value[j]
+    for k in range(N):
+        rows = n
+        for i in range(first[k], first[k + 1]):
+            w, g = weight[i], lead[i]
+            for c in range(n + b):
+                C[rows, c] = 0.0
+            C[rows, who[i]] = w
+            C[rows, errors] = w
+            C[rows, errors + 1] = w * g
+            C[rows, errors + 2] = 0.5 * w * g * g
+            C[rows, n] = w * value[i]
+            if b > 1:
+                for j in range(B):
+                    C[rows, n + 1 + who[i] * B + j] = w * design[i, j]
+            rows += 1
+        reflect_columns(C[:rows], rows, n)
+        left = rows - n
+        if left > 0:
+            for i in range(left):
+                for c in range(b):
+                    G[b + i, c] = C[n + i, n + c]
+            for i in range(b):
+                for c in range(b):
+                    G[i, c] = T[i, c]
+            reflect_columns(G[: b + left], b + left, b)
+            for i in range(b):
+                for c in range(b):
+                    T[i, c] = G[i, c]
+        for j in range(n):
+            logdet += np.log(abs(C[j, j])) if k == N - 1 else 0.0
+        if k == N - 1:
+            if keep:
+                Rkk[k] = C[:n, :n]
+                D[k] = C[:n, n:]
+            break
+        for i in range(2 * n):
+            for c in range(2 * n + b):
+                A[i, c] = 0.0
+        for i in range(n):
+            for c in range(i, n):
+                A[i, c] = C[i, c]
+            for c in range(b):
+                A[i, 2 * n + c] = C[i, n + c]
+        for j in range(errors):
+            f = phi[k, j]
+            w = 1.0 / (sigma[j] * np.sqrt(1.0 - f * f))
+            A[n + j, j] = -w * f
+            A[n + j, n + j] = w
+        for i in range(3):
+            for j in range(3):
+                A[n + errors + i, errors + j] = -WF[i, j] / noise[k]
+                A[n + errors + i, n + errors + j] = W[i, j] / noise[k]
+            A[n + errors + i, 2 * n] = W[i, 2] * drive[k] / noise[k]
+        reflect_columns(A, 2 * n, n)
+        for j in range(n):
+            logdet += np.log(abs(A[j, j]))
+        if keep:
+            Rkk[k] = A[:n, :n]
+            Rkn[k] = A[:n, n : 2 * n]
+            D[k] = A[:n, 2 * n :]
+        for i in range(n):
+            for c in range(n):
+                C[i, c] = A[n + i, n + c]
+            for c in range(b):
+                C[i, n + c] = A[n + i, 2 * n + c]
+    return logdet
+
+
+@njit(cache=True)
+def back(Rkk: FloatArray, Rkn: FloatArray, D: FloatArray, X: FloatArray) -> None:
+    """Substitute backwards (spec 15.3) for all right-hand sides at once: X (N, n, b) filled."""
+    N, n = Rkk.shape[0], Rkk.shape[1]
+    b = D.shape[2]
+    for k in range(N - 1, -1, -1):
+        X[k] = D[k]
+        if k < N - 1:
+            for i in range(n):
+                for j in range(n):
+                    f = Rkn[k, i, j]
+                    for c in range(b):
+                        X[k, i, c] -= f * X[k + 1, j, c]
+        for i in range(n - 1, -1, -1):
+            for j in range(i + 1, n):
+                f = Rkk[k, i, j]
+                for c in range(b):
+                    X[k, i, c] -= f * X[k, j, c]
+            for c in range(b):
+                X[k, i, c] /= Rkk[k, i, i]
+
+
+@njit(cache=True)
+def covariances(Rkk: FloatArray, Rkn: FloatArray, axis: FloatArray, cross: FloatArray) -> None:
+    """Marginal covariance of [y, y', y''] (N, 3, 3) and var of the step in y'' (N-1,), borders held fixed (spec 15.3)."""
+    N, n = Rkk.shape[0], Rkk.shape[1]
+    a = n - 3
+    P = np.zeros((n, n))
+    G = np.zeros((n, n))
+    V = np.zeros((n, n))
+    H = np.zeros((n, n))
+    for k in range(N - 1, -1, -1):
+        # V = Rkk^-1, upper triangular
+        for j in range(n):
+            for i in range(n):
+                V[i, j] = 0.0
+        for i in range(n - 1, -1, -1):
+            V[i, i] = 1.0 / Rkk[k, i, i]
+            for m in range(i + 1, n):
+                f = -Rkk[k, i, m] / Rkk[k, i, i]
+                for j in range(m, n):
+                    V[i, j] += f * V[m, j]
+        if k < N - 1:
+            for i in range(n):
+                for j in range(n):
+                    G[i, j] = 0.0
+                for m in range(i, n):
+                    f = -V[i, m]
+                    for j in range(n):
+                        G[i, j] += f * Rkn[k, m, j]
+            for i in range(n):
+                for j in range(n):
+                    H[i, j] = 0.0
+                for m in range(n):
+                    f = G[i, m]
+                    for j in range(n):
+                        H[i, j] += f * P[m, j]
+            after = P[a + 2, a + 2]
+            between = H[a + 2, a + 2]
+            for i in range(n):
+                for j in range(n):
+                    t = 0.0
+                    for m in range(n):
+                        t += H[i, m] * G[j, m]
+                    P[i, j] = t
+        else:
+            for i in range(n):
+                for j in range(n):
+                    P[i, j] = 0.0
+        for i in range(n):
+            for j in range(i, n):
+                t = 0.0
+                for m in range(j, n):
+                    t += V[i, m] * V[j, m]
+                P[i, j] += t
+                if j > i:
+                    P[j, i] = P[i, j]
+        if k < N - 1:
+            cross[k] = after + P[a + 2, a + 2] - 2.0 * between
+        for i in range(3):
+            for j in range(3):
+                axis[k, i, j] = P[a + i, a + j]

@@ -1,0 +1,349 @@
+"""Survey runs become a reference track model: the story of a build.
+
+Fixes come into the grid; runs that follow one another make a line, and the runs of a line its tracks; along a nominal curve each
+run becomes a profile of distances to the right; what runs differ by shows their frame offsets and how they err; the chain
+across, with all that beside it, gives the axis; the axis becomes the next nominal curve. Heights go the same way. At the end
+the axes are tabulated by true ground length, with their covariances and a report.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railnav.errors import RunError
+from railnav.survey import report, surveyed
+from railnav.survey.axis import solve, sweep
+from railnav.survey.fixes import Fixes, gather
+from railnav.survey.grouping import tracks_of_line
+from railnav.survey.noise import error_models, run_models
+from railnav.survey.nominal import course, lines, smooth_course
+from railnav.survey.offsets import Offsets, differences, settle
+from railnav.survey.surveyed import Surveyed
+from railnav.survey.vertical import Heights, estimate_heights, measured_cant
+
+if TYPE_CHECKING:
+    from railnav.geodesy.grid import GridFrame
+    from railnav.run import Progress, Run
+    from railnav.track.alignment import KnotTable
+    from railnav.track.model import TrackModel
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+#: Distance between nodes while the lie of the runs is not known, m.
+COARSE_STEP = 20.0
+#: Smoothing of the first nominal curves (Gaussian sigma), m.
+SMOOTHING = (40.0, 20.0)
+#: Reach of the first nominal curve, m: two tracks of a line part this far at most.
+LINE_REACH = 150.0
+#: What runs may be off before anything is known of them, m.
+FIRST_SPREAD = 20.0
+#: Estimations; the first `RELAID` of them each give a new nominal curve.
+ROUNDS, RELAID = 4, 2
+#: How far the first guess of an axis may be off, m: no verdict on runs within that.
+FIRST_SLACK = 1.0
+#: Runs farther apart than this, degrees of latitude or longitude, are not of one survey.
+FARTHEST_DEG = 0.5
+#: A run that moves less than this surveys nothing, m.
+SHORTEST = 200.0
+
+
+def build(
+    runs: Sequence[Run],
+    *,
+    crs: str | None = None,
+    zone_width: Literal[3, 6] = 6,
+    ellipsoid: str = "wgs84",
+    spacing: float = 1.0,
+    progress: Progress | None = None,
+) -> TrackModel:
+    """Build a reference track model from survey runs.
+
+    Each track is a square-root chain along a nominal curve (state: distance to the right, slope, curvature correction, and one
+    correlated error a run), with the runs' frame offsets as border parameters of all chains. Only distances across the track
+    are used, so that uneven time stamps do not matter; a stop weighs no more than a pass; error models come from the
+    differences of runs; doubtful fixes lose weight, gross ones and stretches on another track are set aside and reported.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+        Drives with GNSS, in any number and direction. `Run.direction` names the track of a double line; without it geometry
+        decides.
+    crs : str, optional
+        Any projected coordinate system that PROJ knows; default: the Gauss-Krueger zone that fits.
+    zone_width : {6, 3}
+        Width of that zone, degrees.
+    ellipsoid : str
+        Its ellipsoid (see `railnav.geodesy.grid.choose_frame`).
+    spacing : float
+        Distance between knots, m.
+    progress : callable, optional
+        Called with the stage, how much is done and how much there is.
+
+    Returns
+    -------
+    TrackModel
+        One track a direction (or as the data tell), offsets growing as the first run of the line went. `covariance_g` is that of
+        the axis relative to the model's datum. `provenance["build"]` is the report (keys: `railnav.survey.report`).
+
+    Raises
+    ------
+    RunError
+        No run, no usable fixes, a run in another part of the world.
+    CrsError
+        No plane fits.
+
+    Notes
+    -----
+    What all runs of a track have in common shows in no difference: the datum is the equally weighted mean of the kinds of receiver
+    (by majority where there are three or more), and its uncertainty is stated beside the model, not in the knots. Tracks
+    shorter than a few hundred metres, loops that touch themselves and lines that branch are not resolved: each run belongs to
+    one track along its whole way, apart from stretches set aside.
+
+    References
+    ----------
+    Specification rail 4 to 6 and 15 to 18.
+
+    Examples
+    --------
+    >>> from railnav.survey import build
+    >>> build([])
+    Traceback (most recent call last):
+        ...
+    railnav.errors.RunError: no runs to build from; give one folder or more, each a drive with GNSS
+    """
+    runs = list(runs)
+    tell = progress or _silent
+    _refuse_strangers(runs)
+    frame = _frame(runs, crs, zone_width, ellipsoid)
+    survey = _gathered(runs, frame, tell)
+    tracks = _laid_out(survey)
+    tell("lay out", 1, 1)
+    tracks, offsets = _compared(survey, tracks)
+    tell("compare", 1, 1)
+    tracks, offsets = _estimated(survey, tracks, offsets, tell)
+    heights, up = estimate_heights(tracks, survey.receivers, survey.kind, survey.stated_up)
+    survey.settle_reasons(tracks)
+    return _assembled(survey, tracks, offsets, heights, up, frame, spacing, tell)
+
+
+def _silent(stage: str, done: int, total: int) -> None:
+    pass
+
+
+def _refuse_strangers(runs: Sequence[Run]) -> None:
+    """Refuse runs that cannot be of one survey: by boxes that touch within half a degree."""
+    if not runs:
+        raise RunError("no runs to build from", remedy="give one folder or more, each a drive with GNSS")
+    boxes = []
+    for run in runs:
+        gnss = run.gnss
+        if gnss is None or len(gnss) == 0:
+            raise RunError("no GNSS fixes", file=run.source or run.id, remedy="leave this run out of the build")
+        low, high = (np.degrees([np.quantile(gnss.latitude, q), np.quantile(gnss.longitude, q)]) for q in (0.02, 0.98))
+        boxes.append((low, high))
+    group = list(range(len(runs)))
+    for i, (low_i, high_i) in enumerate(boxes):
+        for j, (low_j, high_j) in enumerate(boxes[:i]):
+            if (low_i <= high_j + FARTHEST_DEG).all() and (low_j <= high_i + FARTHEST_DEG).all():
+                old, new = group[i], group[j]
+                group = [new if g == old else g for g in group]
+    sizes = {g: group.count(g) for g in group}
+    home = max(sizes, key=lambda g: (sizes[g], -group.index(g)))
+    for run, g, (low, high) in zip(runs, group, boxes, strict=True):
+        if g != home:
+            middle = 0.5 * (low + high)
+            there = runs[group.index(home)]
+            raise RunError(
+                f"the run lies around latitude {middle[0]:.2f}, longitude {middle[1]:.2f} deg, far from {there.id} and the others",
+                file=run.source or run.id,
+                remedy="build lines in different places one by one",
+            )
+
+
+def _frame(runs: Sequence[Run], crs: str | None, zone_width: Literal[3, 6], ellipsoid: str) -> GridFrame:
+    from railnav.geodesy.grid import choose_frame
+
+    latitude = np.concatenate([r.gnss.latitude[:: max(1, len(r.gnss) // 500)] for r in runs if r.gnss is not None])
+    longitude = np.concatenate([r.gnss.longitude[:: max(1, len(r.gnss) // 500)] for r in runs if r.gnss is not None])
+    return choose_frame(latitude, longitude, crs=crs, zone_width=zone_width, ellipsoid=ellipsoid)
+
+
+def _gathered(runs: Sequence[Run], frame: GridFrame, tell: Progress) -> report.Survey:
+    """Bring all runs into the grid; a run with too few fixes stays out, unless it is the only one."""
+    fixes: list[Fixes] = []
+    courses: list[FloatArray] = []
+    refused: list[tuple[Run, str]] = []
+    for i, run in enumerate(runs):
+        tell("gather", i, len(runs))
+        try:
+            found = gather(run, frame)
+        except RunError as error:
+            if len(runs) == 1:
+                raise
+            refused.append((run, error.cause))
+            continue
+        way = course(found)
+        length = float(np.hypot(*np.diff(way, axis=0).T).sum()) if len(way) > 1 else 0.0
+        if length < SHORTEST:
+            cause = f"it moves over {length:.0f} m only; a survey needs {SHORTEST:.0f} m"
+            if len(runs) == 1:
+                raise RunError(cause, file=run.source or run.id)
+            refused.append((run, cause))
+            continue
+        fixes.append(found)
+        courses.append(way)
+    tell("gather", len(runs), len(runs))
+    if not fixes:
+        run, cause = refused[0]
+        raise RunError(f"no run can be used: {cause}", file=run.source or run.id)
+    return report.Survey(fixes, courses, refused)
+
+
+def _laid_out(survey: report.Survey) -> list[Surveyed]:
+    """Sort runs into lines and tracks, and lay each track's runs along its line's first nominal curve."""
+    fixes = survey.fixes
+    tracks: list[Surveyed] = []
+    for line in lines(survey.courses):
+        members = tuple(line.members)
+        nominal = smooth_course(line.course, COARSE_STEP, SMOOTHING[0])
+        whole = surveyed.lay("", members, fixes, nominal, reach=LINE_REACH)
+        if whole.laid[0].sense < 0:  # offsets grow as the first run went
+            nominal = nominal.reversed()
+            whole = surveyed.lay("", members, fixes, nominal, reach=LINE_REACH)
+        groups, warnings = tracks_of_line(
+            whole.profile.right,
+            whole.design,
+            [fixes[i].run.direction for i in members],
+            [t.sense for t in whole.laid],
+            [fixes[i].run.id for i in members],
+        )
+        survey.warnings += warnings
+        for group in groups:
+            who = tuple(members[i] for i in group)
+            tracks.append(surveyed.lay(survey.name_track(who, tracks), who, fixes, nominal, reach=LINE_REACH))
+    return [t for t in tracks if t.profile.present.any()]
+
+
+def _compared(survey: report.Survey, tracks: list[Surveyed]) -> tuple[list[Surveyed], Offsets]:
+    """From differences between runs alone: frame offsets, error models, and a nominal curve along the middle of each track."""
+    kinds = len(survey.receiver_names)
+    coarse = max(COARSE_STEP, 1.25 * max(surveyed.fix_spacing(t) for t in tracks))
+    nowhere = np.zeros((len(survey.fixes), 2))
+
+    def compare(scale: float) -> Offsets:
+        known = []
+        for t in tracks:
+            value = surveyed.reduced(t, nowhere, coarse).value
+            node = np.minimum(np.arange(value.shape[1]) * coarse / t.nominal.step, len(t.nominal) - 1).astype(np.int64)
+            known.append(differences(value, t.design[node], t.runs))
+        return settle(known, survey.kind, np.full(kinds, scale), 2)
+
+    spread = FIRST_SPREAD
+    offsets = compare(1.0)
+    for turn, width in enumerate(SMOOTHING):
+        for t in tracks:
+            t.axis = surveyed.middle_axis(t, offsets.run, spread, coarse, width)
+        offsets = compare(1.0 if turn == 0 else 0.3 * spread)
+        samples = [surveyed.reduced(t, offsets.run, coarse, survey.receivers) for t in tracks]
+        survey.models, survey.assumed = error_models(samples, survey.stated)
+        spread = max(m.total for m in survey.models.values())
+        last = turn == len(SMOOTHING) - 1
+        for i, t in enumerate(tracks):
+            t.errors = run_models(samples[i], survey.models)
+            tracks[i] = surveyed.relaid(t, survey.fixes, step=step_for(spread) if last else None)
+    return tracks, offsets
+
+
+def step_for(spread: float) -> float:
+    """Distance between nodes that goes with the accuracy of the runs, m."""
+    return 5.0 if spread < 0.2 else 10.0 if spread < 1.0 else COARSE_STEP
+
+
+def _estimated(
+    survey: report.Survey, tracks: list[Surveyed], offsets: Offsets, tell: Progress
+) -> tuple[list[Surveyed], Offsets]:
+    """Estimate axes and frame offsets together, weights from the round before."""
+    scale = np.array([0.5 * survey.models[name].correlated for name in survey.receiver_names])
+    for turn in range(ROUNDS):
+        tell("estimate", turn, ROUNDS)
+        slack = FIRST_SLACK if turn == 0 else 0.0
+        chains = []
+        for t in tracks:
+            surveyed.reject(t, offsets.run, slack)
+            if t.noise_level == 0.0:
+                t.noise_level = surveyed.choose_noise(surveyed.cross_chain(t, offsets.run, slack, level=1e-4))
+            chains.append(surveyed.cross_chain(t, offsets.run, slack))
+        swept = [sweep(chain) for chain in chains]
+        offsets = settle([surveyed.know(t, s) for t, s in zip(tracks, swept, strict=True)], survey.kind, scale, 2)
+        for i, t in enumerate(tracks):
+            who = (np.array(t.runs)[:, None] * 2 + np.arange(2)).ravel()
+            t.estimate = solve(
+                chains[i], swept[i], offsets.run.ravel()[who], offsets.covariance[np.ix_(who, who)], sure=True
+            )
+            t.axis = t.estimate.state[:, 0]
+            t.noise = surveyed.local_noise(t.estimate, t.noise_level, t.nominal.step)
+            tracks[i] = surveyed.relaid(t, survey.fixes) if turn < RELAID else surveyed.cut_ends(t)
+    tell("estimate", ROUNDS, ROUNDS)
+    return tracks, offsets
+
+
+def _assembled(
+    survey: report.Survey,
+    tracks: list[Surveyed],
+    offsets: Offsets,
+    heights: list[Heights | None],
+    up: Offsets | None,
+    frame: GridFrame,
+    spacing: float,
+    tell: Progress,
+) -> TrackModel:
+    """Tabulate the axes by true ground length and put the model together."""
+    from railnav.track.assembly import TrackSection, assemble
+
+    tables: list[KnotTable] = []
+    for i, (t, h) in enumerate(zip(tracks, heights, strict=True)):
+        tell("tabulate", i, len(tracks))
+        tables.append(_knots(t, offsets, h, frame, spacing))
+    tell("tabulate", len(tracks), len(tracks))
+    sections = [TrackSection(t.name, table) for t, table in zip(tracks, tables, strict=True)]
+    text = report.compose(survey, tracks, offsets, heights, up, tables)
+    return assemble(frame, sections, provenance={"made_by": "railnav build", "build": text})
+
+
+def _knots(t: Surveyed, offsets: Offsets, heights: Heights | None, frame: GridFrame, spacing: float) -> KnotTable:
+    """Lay the final curve of one track and give each knot its covariance."""
+    from railnav.track.alignment import fit_alignment
+
+    assert t.estimate is not None
+    e, n = t.nominal.normal
+    across = t.estimate.covariance[:, 0, 0]
+    # a shift of the frame moves the axis along as well: its part along, and what that has in common with the part across
+    shift = offsets.common(t.runs)
+    along = (t.nominal.tangent_e, t.nominal.tangent_n)
+    common = [
+        a[0] * (shift[0, 0] * b[0] + shift[0, 1] * b[1]) + a[1] * (shift[1, 0] * b[0] + shift[1, 1] * b[1])
+        for a, b in ((along, along), (along, (e, n)))
+    ]
+    lengthwise, mixed = common
+    mixed = np.clip(mixed, -0.99 * np.sqrt(across * lengthwise), 0.99 * np.sqrt(across * lengthwise))
+    covariance = np.full((len(e), 6), np.nan)
+    covariance[:, 0] = across * e * e + lengthwise * n * n - 2.0 * mixed * e * n
+    covariance[:, 1] = across * e * n - lengthwise * e * n + mixed * (e * e - n * n)
+    covariance[:, 3] = across * n * n + lengthwise * e * e + 2.0 * mixed * e * n
+    if heights is not None:
+        covariance[:, [2, 4]] = 0.0
+        covariance[:, 5] = heights.variance
+    return fit_alignment(
+        frame,
+        t.nominal.easting + t.axis * e,
+        t.nominal.northing + t.axis * n,
+        None if heights is None else heights.height,
+        cant=measured_cant(t),
+        covariance_g=covariance,
+        spacing=spacing,
+    )

@@ -1,0 +1,326 @@
+"""One track under estimation: its runs along a nominal curve, robust weights, the chain across and the chain of heights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railnav.survey import _kernels
+from railnav.survey.axis import Chain, ErrorModel, Estimate, Swept, log_evidence
+from railnav.survey.fixes import GROSS, OTHER_TRACK, USED, Fixes
+from railnav.survey.noise import Sample
+from railnav.survey.nominal import Nominal
+from railnav.survey.offsets import Knowledge
+from railnav.survey.profiles import Profiles, Traverse, profiles, traverse
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+#: Fixes farther than this from the nominal curve of a track are not of it, m.
+REACH = 60.0
+#: A single run's way beyond all others is cut when no longer than this, m.
+LONE_END = 500.0
+#: Beyond this many sigma a node mean begins to lose weight (Huber).
+HUBER = 2.5
+#: A fix this many sigma off the axis is a gross error.
+GROSS_RATIO = 6.0
+#: A deviation of one sign over this length, m, and at least this size, m, is another track.
+OTHER_LENGTH, OTHER_SIZE = 100.0, 1.5
+#: Two tracks are no closer than this, m: values of precise runs farther apart are never averaged.
+TRACKS_APART = 1.5
+#: Curvature noise that is tried, 1/m per sqrt(m); the steepest clothoid, 1/(300 m * 50 m) over its 50 m, needs 5e-4.
+NOISES = (1e-6, 3e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3)
+#: Degrees of freedom and reach, m, with which the curvature noise follows the track.
+LOCAL_DOF, LOCAL_REACH = 2.0, 30.0
+
+
+@dataclass(slots=True, eq=False)
+class Surveyed:
+    """A track and the runs on it.
+
+    Attributes
+    ----------
+    name : str
+        Identifier of the track.
+    runs : tuple of int
+        Who takes part.
+    nominal : Nominal
+    laid : list of Traverse
+        The runs along the nominal curve.
+    profile : Profiles
+    axis : (N,) array
+        Best guess of the axis: distance to the right of the nominal curve, m.
+    errors : list of ErrorModel
+        How each run errs.
+    noise_level : float
+        Curvature noise of the whole track, 1/m per sqrt(m); 0 until it is chosen.
+    noise : (N-1,) array
+        Curvature noise between nodes.
+    estimate : Estimate or None
+        The last estimate, relative to `nominal`.
+    """
+
+    name: str
+    runs: tuple[int, ...]
+    nominal: Nominal
+    laid: list[Traverse]
+    profile: Profiles
+    axis: FloatArray
+    errors: list[ErrorModel] = field(default_factory=list)
+    noise_level: float = 0.0
+    noise: FloatArray = field(default_factory=lambda: np.zeros(0))
+    estimate: Estimate | None = None
+
+    @property
+    def design(self) -> FloatArray:
+        """Normal of the nominal curve, (N, 2): what one metre east and north adds to a distance to the right."""
+        return np.column_stack(self.nominal.normal)
+
+    def levelled(self, offset: FloatArray) -> FloatArray:
+        """Distances to the right with the runs' frame offsets (R, 2) removed, (K, N)."""
+        return np.asarray(self.profile.right - offset[list(self.runs)] @ self.design.T)
+
+
+def lay(
+    name: str, runs: tuple[int, ...], fixes: Sequence[Fixes], nominal: Nominal, *, reach: float = REACH
+) -> Surveyed:
+    """Lay runs along a nominal curve and cut it where they end."""
+    laid = [traverse(nominal, fixes[i], reach) for i in runs]
+    profile = profiles(laid, len(nominal), nominal.step)
+    return cut_ends(Surveyed(name, runs, nominal, laid, profile, np.zeros(len(nominal))))
+
+
+def cut_ends(track: Surveyed) -> Surveyed:
+    """Cut a track to what its used fixes cover.
+
+    With three runs or more, a short end (up to 500 m) that a single run reaches is cut as well: at a terminus every run stops
+    somewhere else, on another platform track, and wanders.
+    """
+    ends = [np.flatnonzero(row) for row in track.profile.present if row.any()]
+    N = len(track.nominal)
+    if not ends:
+        return track
+    first, last = sorted(int(e[0]) for e in ends), sorted(int(e[-1]) for e in ends)
+    a, b = first[0], last[-1]
+    if len(track.runs) >= 3 and len(ends) >= 2:
+        short = LONE_END / track.nominal.step
+        a = first[1] if first[1] - a <= short else a
+        b = last[-2] if b - last[-2] <= short else b
+    if (a == 0 and b == N - 1) or b - a < 3:
+        return track
+    keep = slice(a, b + 1)
+    laid = []
+    for t in track.laid:
+        offset = t.offset - a * track.nominal.step
+        outside = ~((offset >= -0.5 * track.nominal.step) & (offset <= (b - a + 0.5) * track.nominal.step))
+        laid.append(replace(t, offset=np.where(outside, np.nan, offset), right=np.where(outside, np.nan, t.right)))
+    nominal = track.nominal.part(a, b + 1)
+    e = track.estimate
+    if e is not None:
+        e = Estimate(e.state[keep], e.covariance[keep], e.step_power[a:b])
+    return replace(
+        track,
+        nominal=nominal,
+        laid=laid,
+        profile=profiles(laid, len(nominal), nominal.step),
+        axis=track.axis[keep],
+        noise=track.noise[a:b],
+        estimate=e,
+    )
+
+
+def middle_axis(track: Surveyed, offset: FloatArray, spread: float, step: float, smooth: float) -> FloatArray:
+    """Guess the axis without a model: every `step` metres the middle of the largest clump of runs, smoothed.
+
+    Clumps are separated by `TRACKS_APART` or six times `spread`, whichever is more; between equal clumps the run that stands first
+    in the track decides all along, so that the axis stays on one real track.
+    """
+    from scipy.ndimage import gaussian_filter1d
+
+    value = reduced(track, offset, step).value
+    guess, clumps = np.empty(value.shape[1]), np.empty(value.shape[1], np.int64)
+    _kernels.middle(value, max(TRACKS_APART, 6.0 * spread), guess, clumps)
+    known = np.isfinite(guess)
+    at = np.arange(len(guess)) * step
+    guess = np.interp(at, at[known], guess[known])
+    if smooth > 0:
+        guess = gaussian_filter1d(guess, smooth / step, mode="nearest")
+    return np.asarray(track.axis + np.interp(np.arange(len(track.nominal)) * track.nominal.step, at, guess))
+
+
+def fix_spacing(track: Surveyed) -> float:
+    """How far apart the fixes of a moving run usually lie, m; the widest of the runs."""
+    widest = 0.0
+    for t in track.laid:
+        s = t.offset[(t.fixes.reason == USED) & np.isfinite(t.offset)]
+        move = np.abs(np.diff(s))
+        move = move[move > 0.5]
+        if len(move):
+            widest = max(widest, float(np.median(move)))
+    return widest
+
+
+def reduced(track: Surveyed, offset: FloatArray, step: float, receivers: list[str] | None = None) -> Sample:
+    """Reduce runs to means every `step` metres of their distance from the present axis, frame offsets removed."""
+    nominal = track.nominal
+    nodes = np.arange(len(nominal))
+    e, n = nominal.normal
+    many = int(np.ceil((len(nominal) - 1) * nominal.step / step)) + 1
+    K = len(track.runs)
+    value, time = np.full((K, many), np.nan), np.zeros((K, many))
+    usual, rate = np.ones(K), np.ones(K)
+    for k, (i, t) in enumerate(zip(track.runs, track.laid, strict=True)):
+        use = np.flatnonzero((t.fixes.reason == USED) & np.isfinite(t.offset))
+        node = np.rint(t.offset[use] / step).astype(np.int64)
+        inside = (node >= 0) & (node < many)
+        use, node = use[inside], node[inside]
+        if not len(use):
+            continue
+        at = t.offset[use] / nominal.step
+        residual = t.right[use] - np.interp(at, nodes, track.axis + offset[i, 0] * e + offset[i, 1] * n)
+        count = np.bincount(node, minlength=many)
+        hit = count > 0
+        value[k, hit] = np.bincount(node, weights=residual, minlength=many)[hit] / count[hit]
+        when = np.bincount(node, weights=t.fixes.time[use], minlength=many)[hit] / count[hit]
+        time[k] = np.interp(np.arange(many), np.flatnonzero(hit), when)
+        usual[k] = np.median(count[hit])
+        rate[k] = 1.0 / max(float(np.median(np.diff(t.fixes.time[use]))), 1e-3) if len(use) > 1 else 1.0
+    kinds = tuple(receivers[i] for i in track.runs) if receivers is not None else ("",) * K
+    return Sample(value, time, usual, rate, kinds)
+
+
+def relaid(track: Surveyed, fixes: Sequence[Fixes], *, step: float | None = None) -> Surveyed:
+    """Make the estimated axis the nominal curve and lay the runs anew."""
+    nominal = track.nominal.shifted(track.axis)
+    if step is not None and step != nominal.step:
+        nominal = nominal.resampled(step)
+    new = lay(track.name, track.runs, fixes, nominal)
+    new.errors, new.noise_level = track.errors, track.noise_level
+    return new
+
+
+def reject(track: Surveyed, offset: FloatArray, slack: float) -> None:
+    """Set aside the fixes that the axis refuses: gross errors, and stretches on another track. Earlier verdicts are forgotten.
+
+    `slack`, m, is how far the present axis itself may be off.
+    """
+    step, nodes = track.nominal.step, np.arange(len(track.nominal))
+    e, n = track.nominal.normal
+    for k, (i, t) in enumerate(zip(track.runs, track.laid, strict=True)):
+        f = t.fixes
+        mine = np.isfinite(t.offset)
+        again = mine & ((f.reason == GROSS) | (f.reason == OTHER_TRACK))
+        f.reason[again] = USED
+        use = np.flatnonzero(mine & (f.reason == USED))
+        if not len(use):
+            continue
+        s = t.offset[use] / step
+        across = np.interp(s, nodes, track.axis + offset[i, 0] * e + offset[i, 1] * n)
+        residual = t.right[use] - across
+        limit = GROSS_RATIO * track.errors[k].total + slack
+        bad = np.abs(residual) > limit
+        f.size[use] = np.abs(residual)
+        f.reason[use[bad]] = GROSS
+        if not bad.any():
+            continue
+        order = np.argsort(s, kind="stable")
+        sign = np.where(bad, np.sign(residual), 0.0)[order]
+        edges = np.flatnonzero(np.diff(np.concatenate([[0.0], sign, [0.0]])))
+        for a, b in pairwise(edges):
+            if sign[a] == 0.0:
+                continue
+            piece = order[a:b]
+            long = (s[order[b - 1]] - s[order[a]]) * step >= OTHER_LENGTH
+            if long and float(np.median(np.abs(residual[piece]))) >= max(OTHER_SIZE, limit):
+                # the way there and back belongs to it: as far as the deviation keeps its sign and stays above two sigma
+                same = np.sign(residual[order]) == sign[a]
+                off = same & (np.abs(residual[order]) > 2.0 * track.errors[k].total)
+                while a > 0 and off[a - 1]:
+                    a -= 1
+                while b < len(order) and off[b]:
+                    b += 1
+                f.reason[use[order[a:b]]] = OTHER_TRACK
+    track.profile = profiles(track.laid, len(track.nominal), step)
+
+
+def cross_chain(track: Surveyed, offset: FloatArray, slack: float, level: float | None = None) -> Chain:
+    """The chain across the track, rows weighted by what is known of each run and by how it stands to the present axis.
+
+    Curvature noise is the track's own, or `level` everywhere.
+    """
+    residual = track.levelled(offset) - track.axis
+    noise = track.noise
+    if level is not None or not len(noise):
+        noise = np.full(len(track.nominal) - 1, track.noise_level if level is None else level)
+    return Chain(
+        step=track.nominal.step,
+        value=track.profile.right,
+        lead=track.profile.lead,
+        variance=white_variances(track.profile, residual, track.errors, slack),
+        time=track.profile.time,
+        design=np.broadcast_to(track.design, (*residual.shape, 2)),
+        errors=track.errors,
+        bend=track.nominal.curvature,
+        noise=noise,
+    )
+
+
+def white_variances(P: Profiles, residual: FloatArray, errors: list[ErrorModel], slack: float) -> FloatArray:
+    """Variance of the white part of each node mean (K, N), inflated for doubtful ones by what a correlated error would be."""
+    variance = np.full(residual.shape, np.nan)
+    for k, model in enumerate(errors):
+        known = np.isfinite(residual[k])
+        if not known.any():
+            continue
+        count = P.count[k][known]
+        # nodes that err together: the doubt of one counts for all of them
+        pace = float(np.median(np.abs(np.diff(P.time[k][known])))) if np.count_nonzero(known) > 1 else 1.0
+        together = max(1.0, 2.0 * model.memory / max(pace, 1e-3))
+        doubt = np.zeros(len(count))
+        stated = P.sigma[k][known]
+        if np.isfinite(stated).any():
+            ratio = stated / float(np.nanmedian(stated))
+            doubt += np.where(np.isfinite(ratio), np.maximum(ratio**2 - 2.0, 0.0), 0.0)
+        strain = np.maximum(np.abs(residual[k][known]) - slack, 0.0) / (HUBER * model.total)
+        doubt += np.maximum(strain - 1.0, 0.0) + np.maximum(strain**2 - 1.0, 0.0)
+        variance[k, known] = model.white**2 / count + doubt * model.total**2 * together
+    return variance
+
+
+def choose_noise(chain: Chain) -> float:
+    """The curvature noise of a whole track that makes its data most likely."""
+    score = [log_evidence(replace(chain, noise=np.full(len(chain.bend) - 1, level))) for level in NOISES]
+    best = int(np.argmax(score))
+    if 0 < best < len(score) - 1:  # the top of the parabola through three points
+        a, b, c = score[best - 1 : best + 2]
+        shift = 0.5 * (a - c) / (a - 2.0 * b + c)
+        low, high = np.log(NOISES[best - 1]), np.log(NOISES[best + 1])
+        return float(np.exp(np.log(NOISES[best]) + np.clip(shift, -0.5, 0.5) * 0.5 * (high - low)))
+    return NOISES[best]
+
+
+def local_noise(estimate: Estimate, level: float, step: float) -> FloatArray:
+    """Curvature noise along the track: what the estimate shows within `LOCAL_REACH`, drawn to the track's own level."""
+    width = max(1, round(LOCAL_REACH / step))
+    box = np.ones(2 * width + 1)
+    power = np.convolve(estimate.step_power / step, box, mode="same")
+    many = np.convolve(np.ones(len(estimate.step_power)), box, mode="same")
+    return np.sqrt((LOCAL_DOF * level**2 + power) / (LOCAL_DOF + many))
+
+
+def know(track: Surveyed, swept: Swept) -> Knowledge:
+    """What a swept chain says of the frame offsets of its runs among each other.
+
+    Of a shift common to all runs the data say nothing; what the chain seems to say of it is the smoothness of the track at work on
+    a curve moved bodily. A free common shift takes that out: rows are projected off its image.
+    """
+    rows, value = swept.border, swept.border_value
+    many = len(track.runs)
+    common = rows @ np.tile(np.eye(rows.shape[1] // many), (many, 1))
+    Q, _ = np.linalg.qr(common)
+    return Knowledge(track.runs, rows - Q @ (Q.T @ rows), value - Q @ (Q.T @ value))
