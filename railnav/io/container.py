@@ -13,6 +13,7 @@ import sqlite3
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -284,7 +285,7 @@ def opened(path: str | Path, content: str, *, newest: int, error: type[InputErro
         if "locked" in str(cause) or "busy" in str(cause):
             raise error("is in use by another program", file=path, remedy="close it there") from cause
         raise _damaged(path, cause, error) from cause
-    except (sqlite3.Error, OverflowError) as cause:
+    except (sqlite3.Error, OverflowError, UnicodeError) as cause:  # damaged names are no UTF-8
         raise _damaged(path, cause, error) from cause
     finally:
         connection.close()
@@ -382,6 +383,7 @@ class Reader:
                 yield name, blob.read()
 
 
+@lru_cache(maxsize=8)
 def describe_crs(crs_wkt: str) -> tuple[str, int, str, str, str]:
     """Describe a coordinate system as GeoPackage wants it.
 

@@ -200,7 +200,7 @@ def _write_tracks(container: Container, model: TrackModel) -> None:
 
     container.add_layer(
         "tracks",
-        "track TEXT NOT NULL UNIQUE, line TEXT NOT NULL, name TEXT NOT NULL, length_m DOUBLE, start_km DOUBLE, "
+        "track TEXT NOT NULL UNIQUE, line TEXT, name TEXT, length_m DOUBLE, start_km DOUBLE, "
         "end_km DOUBLE, start_node TEXT NOT NULL, end_node TEXT NOT NULL",
         rows(),
         geometry="LINESTRING",
@@ -321,8 +321,10 @@ class _Rows:
         self._cells = dict(zip(columns, zip(*rows, strict=True), strict=True)) if rows else dict.fromkeys(columns, ())
 
     def refuse(self, row: int, column: str, cause: str) -> NoReturn:
-        cause = f"row {row + 1}, column {column}: {cause}"
-        raise self._reader.error(cause, file=self._reader.path, column=self._table, remedy="make the model again")
+        where = f"{self._table}.{column}"
+        raise self._reader.error(
+            cause, file=self._reader.path, row=row + 1, column=where, remedy="make the model again"
+        )
 
     def texts(self, column: str) -> tuple[str, ...]:
         """Text cells; an editor may have left NULL where a text was emptied."""
@@ -446,7 +448,7 @@ def _read_knots(reader: Reader, track_id: tuple[str, ...]) -> tuple[IntArray, di
     count = np.zeros(len(track_id), np.int64)
     lengths = reader.select_lengths("knots", BLOB_COLUMNS)
     for row in range(sizes.length):
-        if not (counts[row] >= 2 and counts[row] == int(counts[row])):
+        if not 2 <= counts[row] < 2**40 or counts[row] % 1:
             sizes.refuse(row, "knots", f"{counts[row]:g} is no number of knots")
         count[place[row]] = int(counts[row])
         for name, length in zip(BLOB_COLUMNS, lengths[row], strict=True):

@@ -13,9 +13,9 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from small import frame_of
 
 from railnav.errors import InputError
-from railnav.geodesy.grid import choose_frame
 from railnav.io.geopackage import read_model, write_model
 from railnav.io.solution import read_solution, write_solution
 from railnav.io.truth import read_truth, write_truth
@@ -32,7 +32,7 @@ ENDINGS = ("csv", "parquet", "gpkg", "geojson")
 def make_solution(*, seed=1, crs=True, datum_shift=0.0):
     """Twelve epochs: lost, then forwards on one track, a stand, backwards on another, lost again."""
     random = np.random.default_rng(seed)
-    frame = choose_frame(np.radians(47.5), np.radians(19.1))
+    frame = frame_of(47.5, 19.1)
     track = np.array([-1, 0, 0, 0, 0, 2, 2, 2, 2, 2, 2, -1])
     none = track < 0
     offset = np.array([np.nan, 10, 20, 30, 30.0001, 400, 390, 380, 380, 380, 370, np.nan])
