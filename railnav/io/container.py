@@ -274,7 +274,7 @@ def opened(path: str | Path, content: str, *, newest: int, error: type[InputErro
             raise error("is empty", file=path, remedy="make it again")
         connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=5.0, isolation_level=None)
     except (OSError, ValueError, sqlite3.Error) as cause:
-        raise error(f"cannot be opened ({cause})", file=path) from cause
+        raise error(f"cannot be opened ({_one_line(cause)})", file=path) from cause
     try:
         connection.execute("PRAGMA trusted_schema = OFF")
         connection.execute("PRAGMA query_only = ON")
@@ -291,8 +291,12 @@ def opened(path: str | Path, content: str, *, newest: int, error: type[InputErro
         connection.close()
 
 
+def _one_line(text: object) -> str:
+    return " ".join(str(text).split())
+
+
 def _damaged(path: Path, cause: Exception, error: type[InputError]) -> InputError:
-    text = f"is no GeoPackage, or a damaged one ({cause})"
+    text = f"is no GeoPackage, or a damaged one ({_one_line(cause)})"
     return error(text, file=path, remedy="make it again, or take it from where it came")
 
 
@@ -317,7 +321,7 @@ class Reader:
 
     def refuse(self, cause: str, *, layer: str | None = None, remedy: str | None = None) -> NoReturn:
         """Raise the error for this file."""
-        raise self.error(cause, file=self.path, column=layer, remedy=remedy)
+        raise self.error(_one_line(cause), file=self.path, column=layer, remedy=_one_line(remedy or "") or None)
 
     def tables(self) -> set[str]:
         """Names of the tables in the file; views do not count."""
