@@ -1,0 +1,120 @@
+"""Inner loops of the fixed-interval smoother: lineages of records, from the last epoch back. No validation."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from railnav.estimation._kernels import smooth_kernel
+from railnav.navigation._kernels import (
+    FORCE,
+    POSITION,
+    R_EPOCH,
+    R_PARENT,
+    R_PULL,
+    R_SHAKE,
+    R_SLIP,
+    R_STEP,
+    R_VERSION,
+    SPEED,
+    TIME,
+    transition,
+)
+
+
+@njit(cache=True)
+def lineage(records, last, chain):  # record index, (m,) out by epoch: record index or -1
+    """Walk from a record to its ancestors; gives the first epoch of the lineage."""
+    r = last
+    e = int(records.numbers[r, R_EPOCH])
+    while r >= 0:
+        e = int(records.numbers[r, R_EPOCH])
+        chain[e] = r
+        r = int(records.numbers[r, R_PARENT])
+    return e
+
+
+@njit(cache=True)
+def window_index(records, version, s):  # path coordinate -> index in a stored window
+    """Which track of a stored window holds a path coordinate."""
+    i = 0
+    while i < records.count[version] - 1 and s >= records.begin[version, i + 1]:
+        i += 1
+    return i
+
+
+@njit(cache=True)
+def smooth_lineage(fil, records, epochs, chain, first, last, x, sigma):
+    """Carry the smoothed state back along a lineage (Rauch-Tung-Striebel in square roots, noise as the filter applied it)."""
+    # chain (m,) record by epoch; x (m, n) and sigma (m, 2: position, speed) out
+    n = x.shape[1]
+    i_s, i_v = fil.at[POSITION], fil.at[SPEED]
+    F = np.empty((n, n))
+    Q = np.empty((14, n))
+    lead = np.empty(14, np.int64)
+    new = np.empty(n)
+    gain = np.empty((n, n))
+    state = records.x[chain[last]].copy()
+    P_sqrt = records.P_sqrt[chain[last]].copy()
+    next_state = np.empty(n)
+    next_P = np.empty((n, n))
+    for e in range(last, first - 1, -1):
+        if e < last:
+            r = chain[e]
+            numbers = records.numbers[chain[e + 1]]
+            next_state[:] = state
+            next_P[:] = P_sqrt
+            state[:] = records.x[r]
+            P_sqrt[:] = records.P_sqrt[r]
+            dt = epochs[e + 1, TIME] - epochs[e, TIME]
+            columns = transition(
+                fil,
+                state,
+                dt,
+                epochs[e + 1, FORCE],
+                numbers[R_PULL],
+                numbers[R_SLIP],
+                numbers[R_SHAKE],
+                numbers[R_STEP],
+                F,
+                Q,
+                lead,
+                new,
+            )
+            smooth_kernel(state, P_sqrt, F, np.ascontiguousarray(Q[:columns].T), new, next_state, next_P, gain)
+        x[e] = state
+        p = 0.0
+        q = 0.0
+        for j in range(n):
+            p += P_sqrt[i_s, j] ** 2
+            q += P_sqrt[i_v, j] ** 2
+        sigma[e, 0] = np.sqrt(p)
+        sigma[e, 1] = np.sqrt(q)
+
+
+@njit(cache=True)
+def tracks_of(fil, records, chain, first, last, track):  # (m,) out: track by epoch
+    """Track that each filtered record of a lineage stands on."""
+    i_s = fil.at[POSITION]
+    for e in range(first, last + 1):
+        r = chain[e]
+        version = int(records.numbers[r, R_VERSION])
+        i = window_index(records, version, records.x[r, i_s])
+        track[e] = records.track[version, i]
+
+
+@njit(cache=True)
+def place(fil, net_length, records, chain, first, last, x, track, way, offset):
+    """Track, direction and offset of smoothed path coordinates, each in the window of its own epoch."""
+    i_s = fil.at[POSITION]
+    for e in range(first, last + 1):
+        version = int(records.numbers[chain[e], R_VERSION])
+        s = x[e, i_s]
+        i = window_index(records, version, s)
+        t = records.track[version, i]
+        w = records.way[version, i]
+        length = net_length[t]
+        local = min(max(s - records.begin[version, i], 0.0), length)
+        track[e] = t
+        way[e] = w
+        offset[e] = local if w > 0 else length - local

@@ -1,0 +1,280 @@
+"""Epochs: what the navigator is given at one instant, and how the streams of a run become a table of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railnav.errors import RunError
+from railnav.navigation import _kernels as kernel
+from railnav.run import GnssStream, ImuStream, OdometerStream, Run
+
+if TYPE_CHECKING:
+    from railnav.track.model import TrackModel
+
+FloatArray = NDArray[np.float64]
+NAN = math.nan
+
+#: Rotation of the Earth, rad/s.
+EARTH_RATE = 7.292115e-5
+#: Longest step between epochs while an IMU measures, and while nothing does, s.
+IMU_STEP, IDLE_STEP = 0.1, 1.0
+#: Times closer than this are one epoch, s.
+SAME_TIME = 1e-3
+#: Odometer readings closer than this to the one before are left out, s.
+ODOMETER_STEP = 0.08
+#: Sigma of a fix when the receiver states none: without and, per unit of it, with its dilution of precision, m.
+UNSTATED_SIGMA, SIGMA_PER_HDOP = 4.0, 3.0
+#: Sigma of a yaw-rate mean whose spread is not known, rad/s.
+UNSTATED_SIGMA_YAW = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Epoch:
+    """What one instant brings, SI and radians; NaN where it brings nothing.
+
+    Attributes
+    ----------
+    time : float
+        Seconds on the run's clock; later than the epoch before.
+    latitude, longitude : float
+        GNSS antenna, WGS 84, rad.
+    sigma_east, sigma_north : float
+        As the receiver states them, m; NaN: 4 m is assumed, or 3 m times `hdop`.
+    hdop : float
+        Horizontal dilution of precision.
+    speed, course, sigma_speed : float
+        GNSS ground speed, m/s; course over ground from true north, rad; sigma of the speed, m/s.
+    distance : float
+        Odometer: cumulative distance, m.
+    wheel_speed, sigma_wheel_speed : float
+        Odometer: speed and its sigma, m/s.
+    forward_force : float
+        Specific force along the vehicle's nose, mean since the epoch before, m/s^2.
+    yaw_rate, sigma_yaw_rate : float
+        Rate about the vehicle's down axis, mean since the epoch before, and sigma of that mean, rad/s.
+    """
+
+    time: float
+    latitude: float = NAN
+    longitude: float = NAN
+    sigma_east: float = NAN
+    sigma_north: float = NAN
+    hdop: float = NAN
+    speed: float = NAN
+    course: float = NAN
+    sigma_speed: float = NAN
+    distance: float = NAN
+    wheel_speed: float = NAN
+    sigma_wheel_speed: float = NAN
+    forward_force: float = NAN
+    yaw_rate: float = NAN
+    sigma_yaw_rate: float = NAN
+
+
+#: Columns of the raw table of epochs: the fields of `Epoch`.
+COLUMNS = tuple(Epoch.__slots__)
+
+
+def epochs(run: Run) -> Iterator[Epoch]:
+    """A run as the epochs that a live navigator would be given, one after the other.
+
+    Every GNSS fix and odometer reading is an epoch; while an IMU measures, further ones keep the step at 0.1 s at most, and in
+    a gap of everything at 1 s.
+
+    Parameters
+    ----------
+    run : Run
+
+    Yields
+    ------
+    Epoch
+    """
+    for row in raw_table(run).tolist():
+        yield Epoch(*row)
+
+
+def raw_table(run: Run) -> FloatArray:
+    """A run as a table of epochs, (m, 15), columns as the fields of `Epoch`.
+
+    Raises
+    ------
+    RunError
+        The run has no GNSS stream with a fix: there is nothing to start from.
+    """
+    gnss, odometer, imu = run.gnss, run.odometer, run.imu
+    if gnss is None or len(gnss) == 0:
+        raise RunError(
+            f"run {run.id!r} has no GNSS fix: nothing says where on the model it starts",
+            file=run.source,
+            remedy="add a [gnss] stream",
+        )
+    wheel = _chosen_readings(odometer)
+    times = [gnss.time]
+    if odometer is not None and len(wheel):
+        times.append(odometer.time[wheel])
+    time = np.sort(np.concatenate(times))
+    time = time[np.append(True, np.diff(time) > SAME_TIME)]
+    time = _filled(time, imu)
+    table = np.full((len(time), len(COLUMNS)), np.nan)
+    column = {name: i for i, name in enumerate(COLUMNS)}
+    table[:, column["time"]] = time
+    rows = _rows(time, gnss.time)
+    for name in ("latitude", "longitude", "sigma_east", "sigma_north", "hdop", "speed", "course", "sigma_speed"):
+        value = getattr(gnss, name)
+        if value is not None:
+            table[rows, column[name]] = value
+    if odometer is not None and len(wheel):
+        rows = _rows(time, odometer.time[wheel])
+        for name, value in (
+            ("distance", odometer.distance),
+            ("wheel_speed", odometer.speed if odometer.distance is None else None),
+            ("sigma_wheel_speed", odometer.sigma_speed if odometer.distance is None else None),
+        ):
+            if value is not None:
+                table[rows, column[name]] = value[wheel]
+    if imu is not None and len(imu):
+        force, rate, sigma = _inertial_means(imu, time)
+        table[:, column["forward_force"]] = force
+        table[:, column["yaw_rate"]] = rate
+        table[:, column["sigma_yaw_rate"]] = sigma
+    return table
+
+
+def kernel_table(raw: FloatArray, model: TrackModel) -> FloatArray:
+    """Epochs as the kernels read them: fixes in the model's plane, courses from grid north, Earth rate taken off the gyro.
+
+    Parameters
+    ----------
+    raw : (m, 15) array
+        As `raw_table` gives it.
+    model : TrackModel
+
+    Returns
+    -------
+    (m, 15) array
+        Columns as in `railnav.navigation._kernels`.
+    """
+    column = {name: i for i, name in enumerate(COLUMNS)}
+    table = np.full((len(raw), kernel.EPOCH_SIZE), np.nan)
+    table[:, kernel.TIME] = raw[:, column["time"]]
+    rows = np.flatnonzero(np.isfinite(raw[:, column["latitude"]]))
+    if len(rows):
+        easting, northing, _ = model.frame.to_grid(raw[rows, column["latitude"]], raw[rows, column["longitude"]], None)
+        table[rows, kernel.EAST] = easting
+        table[rows, kernel.NORTH] = northing
+        hdop = raw[rows, column["hdop"]]
+        unstated = np.where(np.isfinite(hdop), SIGMA_PER_HDOP * hdop, UNSTATED_SIGMA)
+        for name, target in (("sigma_east", kernel.SIGMA_EAST), ("sigma_north", kernel.SIGMA_NORTH)):
+            sigma = raw[rows, column[name]]
+            table[rows, target] = np.where(np.isfinite(sigma), sigma, unstated)
+        course = raw[rows, column["course"]]
+        if np.isfinite(course).any():
+            bearing = course - model.frame.convergence(easting, northing)
+            table[rows, kernel.COURSE_EAST] = np.sin(bearing)
+            table[rows, kernel.COURSE_NORTH] = np.cos(bearing)
+    for name, target in (
+        ("speed", kernel.GNSS_SPEED),
+        ("sigma_speed", kernel.SIGMA_SPEED),
+        ("distance", kernel.DISTANCE),
+        ("wheel_speed", kernel.WHEEL_SPEED),
+        ("sigma_wheel_speed", kernel.SIGMA_WHEEL),
+        ("forward_force", kernel.FORCE),
+    ):
+        table[:, target] = raw[:, column[name]]
+    # the vehicle is level to within cant and gradient: the Earth's rate about its down axis is -Omega sin(latitude)
+    table[:, kernel.YAW_RATE] = raw[:, column["yaw_rate"]] + EARTH_RATE * math.sin(model_latitude(model))
+    sigma = raw[:, column["sigma_yaw_rate"]]
+    table[:, kernel.SIGMA_YAW] = np.where(np.isfinite(sigma), sigma, UNSTATED_SIGMA_YAW)
+    return table
+
+
+def model_latitude(model: TrackModel) -> float:
+    """Latitude of the middle of a model's first and last knots, rad."""
+    ends = [0, -1]
+    latitude, _, _ = model.frame.to_geodetic(model.easting[ends].mean(), model.northing[ends].mean(), None)
+    return float(latitude)
+
+
+def _chosen_readings(odometer: OdometerStream | None) -> NDArray[np.int64]:
+    """Indices of the odometer readings that are used, at least `ODOMETER_STEP` apart."""
+    if odometer is None or len(odometer) == 0:
+        return np.empty(0, np.int64)
+    time = odometer.time
+    if len(time) < 2 or np.diff(time).min() >= ODOMETER_STEP:
+        return np.arange(len(time))
+    slot = np.floor((time - time[0]) / IMU_STEP + 1e-6).astype(np.int64)
+    return np.flatnonzero(np.append(True, np.diff(slot) > 0))
+
+
+def _filled(time: FloatArray, imu: ImuStream | None) -> FloatArray:
+    """Put further epochs into long steps: 0.1 s apart where an IMU measures, 1 s apart where nothing does."""
+    gap = np.diff(time)
+    longest = np.full(len(gap), 1.5 * IDLE_STEP)
+    step = np.full(len(gap), IDLE_STEP)
+    if imu is not None and len(imu):
+        inside = (time[1:] > imu.time[0]) & (time[:-1] < imu.time[-1])
+        longest[inside] = 1.5 * IMU_STEP
+        step[inside] = IMU_STEP
+    long = np.flatnonzero(gap > longest)
+    if len(long) == 0:
+        return time
+    extra = [time[i] + step[i] * np.arange(1, math.ceil(gap[i] / step[i] - 1e-6)) for i in long.tolist()]
+    return np.sort(np.concatenate([time, *extra]))
+
+
+def _rows(time: FloatArray, of: FloatArray) -> NDArray[np.int64]:
+    """Row of the epoch that stands for each time."""
+    row = np.searchsorted(time, of + 0.5 * SAME_TIME, side="right") - 1
+    return np.asarray(np.maximum(row, 0))
+
+
+def body_from_imu(mounting: FloatArray) -> FloatArray:
+    """Matrix Rz(yaw) Ry(pitch) Rx(roll) that turns IMU axes into body axes, (3, 3).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> body_from_imu(np.array([0.0, 0.0, np.pi / 2])).round(6)[:, 0].tolist()
+    [0.0, 1.0, 0.0]
+    """
+    (cr, cp, cy), (sr, sp, sy) = np.cos(mounting), np.sin(mounting)
+    x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+    y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
+    z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(z @ y @ x)
+
+
+def _inertial_means(imu: ImuStream, time: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Forward force, yaw rate and sigma of the latter's mean between consecutive epochs, (m,) each; NaN where not half covered."""
+    matrix = body_from_imu(imu.mounting)
+    force = imu.specific_force @ matrix[0]
+    rate = imu.gyro @ matrix[2]
+    usual = float(np.median(np.diff(imu.time))) if len(imu) > 1 else IMU_STEP
+    width = np.minimum(np.diff(imu.time, prepend=imu.time[0] - usual), 1.5 * usual)
+    edges = np.column_stack([imu.time - width, imu.time]).ravel()
+    edges = np.maximum.accumulate(edges)
+
+    def between(value: FloatArray) -> FloatArray:
+        total = np.cumsum(value)
+        cumulative = np.column_stack([total - value, total]).ravel()
+        at = np.interp(time, edges, cumulative)
+        return np.diff(at, prepend=NAN)
+
+    covered = between(width)
+    count = between(np.ones(len(width)))
+    span = np.diff(time, prepend=NAN)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        enough = covered >= 0.5 * span
+        mean_force = np.where(enough, between(force * width) / covered, NAN)
+        mean_rate = np.where(enough, between(rate * width) / covered, NAN)
+        # differences of neighbours hold the noise but not the turn itself
+        noise = 0.5 * np.diff(rate, prepend=rate[0]) ** 2
+        sigma = np.sqrt(between(noise) / count / count)
+    sigma = np.where(enough & (count >= 3.0), np.maximum(sigma, 1e-6), NAN)
+    return mean_force, mean_rate, sigma

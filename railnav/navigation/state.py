@@ -1,0 +1,217 @@
+"""What the navigator estimates, and what it assumes: the state by name, and the settings with their reasons."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass, fields
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+class State(IntEnum):
+    """States of the navigator, in an order that makes the transition matrix lower triangular.
+
+    A run carries those that its streams need (`layout`). GNSS errors are E and N components; the correlated part is in units of
+    the fix's own sigma, so that it grows and shrinks with it.
+    """
+
+    FRAME_EAST = 0  # constant part of the GNSS error of a run, m
+    FRAME_NORTH = 1
+    GNSS_EAST = 2  # correlated part of the GNSS error, first-order Gauss-Markov with variance 1, times the fix's sigma
+    GNSS_NORTH = 3
+    ODOMETER_SCALE = 4  # wheel distance = (1 + scale) * distance
+    GYRO_BIAS = 5  # yaw gyro, rad/s
+    ACCELEROMETER_BIAS = 6  # forward accelerometer, m/s^2; takes up the tilt of the mounting too
+    ACCELERATION = 7  # along the nose, m/s^2, Gauss-Markov; only where no accelerometer measures it
+    SPEED = 8  # along the nose, m/s: negative when backing up
+    POSITION = 9  # along the hypothesis' path, growing towards the nose, m
+    WHEEL_DISTANCE = 10  # what the odometer would read without its rounding, m
+
+
+def layout(*, imu: bool, odometer: str) -> IntArray:
+    """Index of each state in the vector that a run needs, -1 where it needs none.
+
+    Parameters
+    ----------
+    imu : bool
+        Whether accelerometer and gyro are there.
+    odometer : str
+        "distance", "speed" or "" (none).
+
+    Returns
+    -------
+    (11,) int array
+        Index by `State`.
+
+    Examples
+    --------
+    >>> layout(imu=False, odometer="").tolist()
+    [0, 1, 2, 3, -1, -1, -1, 4, 5, 6, -1]
+    """
+    needed = {
+        State.ODOMETER_SCALE: odometer != "",
+        State.GYRO_BIAS: imu,
+        State.ACCELEROMETER_BIAS: imu,
+        State.ACCELERATION: not imu,
+        State.WHEEL_DISTANCE: odometer == "distance",
+    }
+    at = np.full(len(State), -1, np.int64)
+    index = 0
+    for state in State:
+        if needed.get(state, True):
+            at[state] = index
+            index += 1
+    return at
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What the navigator assumes of sensors and trains: SI, one value each.
+
+    The defaults are for single-frequency GNSS and MEMS inertial sensors on a train. Receivers' sigmas are taken as they are stated,
+    then scaled by what the innovations show (`scale_prior`, within `scale_least` and `scale_most`).
+
+    Attributes
+    ----------
+    gnss_correlation_time : float
+        Correlation time of the GNSS error, s. Receivers on line 80 show 25-60 s, open-sky code positioning 100 s.
+    gnss_correlated_share, gnss_white_share, gnss_frame_share : float
+        Parts of a stated sigma: correlated, from fix to fix, and constant over the run.
+    frame_sigma_least, frame_sigma_most : float
+        Bounds of the constant part's sigma, m; it grows when a run's fixes lie aside by more than it allows.
+    model_sigma : float
+        Standard deviation of the model's axis, m; counts towards the constant part.
+    scale_prior : float
+        Independent errors that the stated sigma is worth when it is scaled by what is seen.
+    scale_least, scale_most : float
+        Bounds of that scale.
+    gate : float
+        A fix whose squared normalised innovation exceeds this in every hypothesis is suspect (chi-square, 2: 1e-5).
+    step_fixes : float
+        After so many suspect fixes in a row the GNSS error is taken to have stepped.
+    lost_after : float
+        Seconds of suspect fixes after which the navigator starts afresh.
+    speed_sigma : float
+        Sigma of GNSS speed where the receiver states none, m/s.
+    speed_latency : float
+        Lag of such a GNSS speed behind the position, s: its sigma grows by this times the acceleration.
+    course_sigma : float
+        Least sigma of the GNSS course, rad; it adds to sigma_speed / speed.
+    acceleration_sigma, acceleration_time : float
+        Train acceleration where no accelerometer measures it: standard deviation, m/s^2, and correlation time, s.
+    accelerometer_noise : float
+        Density of the forward accelerometer's noise, vibration included, m/s^2/sqrt(Hz).
+    accelerometer_bias, accelerometer_walk : float
+        Bias at the start, m/s^2, and its random walk, m/s^2/sqrt(s).
+    gradient_walk : float
+        Added to that walk where the model has no heights, m/s^2/sqrt(s).
+    gyro_bias, gyro_walk : float
+        Yaw gyro: bias at the start, rad/s, and its random walk, rad/s/sqrt(s).
+    gyro_floor : float
+        Least sigma of one yaw-rate mean of a moving vehicle, rad/s: hunting and track irregularity.
+    gyro_scale : float
+        Sigma of the yaw gyro's scale, tilt included.
+    curvature_sigma, curvature_shift, curvature_length : float
+        Errors of the model's curvature: of its value, 1/m, of the place where it changes, m, and the length over which both are
+        correlated, m.
+    odometer_scale, odometer_scale_walk : float
+        Wheel scale: sigma at the start, and random walk, 1/sqrt(s).
+    odometer_sigma : float
+        Rounding of a distance reading, m.
+    odometer_slip : float
+        Random creep of a rolling wheel, m/sqrt(m).
+    odometer_speed_sigma : float
+        Sigma of an odometer's speed where it states none, m/s.
+    slip_gate : float
+        Sigmas of disagreement at which a wheel slips or slides.
+    slip_longest : float
+        Longest slip, s; after it the wheel is believed again.
+    standstill_sigma : float
+        Sigma of the speed of a train found to stand, m/s.
+    standstill_time : float
+        How long wheels (or a GNSS speed) must rest before the train is held to stand, s.
+    reverse_prior : float
+        Prior probability that a train first moves against its nose.
+    track_confidence : float
+        Posterior at which a track is declared; below it the mode is ambiguous.
+    coasting_after : float
+        Seconds without a GNSS fix after which the mode is coasting.
+    lost_sigma : float
+        Standard deviation along the track beyond which the position is lost, m.
+    sigma_usable : float
+        Fixes with a stated sigma beyond this are not used, m.
+    merge_distance : float
+        Squared Mahalanobis distance below which hypotheses on one path are one.
+    prune_below : float
+        Posterior below which a hypothesis is dropped.
+    most_hypotheses : float
+        Hypotheses kept.
+    gravity : float
+        m/s^2.
+    """
+
+    gnss_correlation_time: float = 60.0
+    gnss_correlated_share: float = 0.95
+    gnss_white_share: float = 0.25
+    gnss_frame_share: float = 0.3
+    frame_sigma_least: float = 0.01
+    frame_sigma_most: float = 20.0
+    model_sigma: float = 0.0
+    scale_prior: float = 3.0
+    scale_least: float = 0.6
+    scale_most: float = 6.0
+    gate: float = 23.0
+    step_fixes: float = 3.0
+    lost_after: float = 30.0
+    speed_sigma: float = 0.4
+    speed_latency: float = 0.8
+    course_sigma: float = 0.01
+    acceleration_sigma: float = 0.4
+    acceleration_time: float = 20.0
+    accelerometer_noise: float = 0.02
+    accelerometer_bias: float = 0.15
+    accelerometer_walk: float = 5e-4
+    gradient_walk: float = 0.02
+    gyro_bias: float = 0.01
+    gyro_walk: float = 5e-6
+    gyro_floor: float = 3e-4
+    gyro_scale: float = 0.01
+    curvature_sigma: float = 2e-5
+    curvature_shift: float = 0.4
+    curvature_length: float = 20.0
+    odometer_scale: float = 0.01
+    odometer_scale_walk: float = 2e-6
+    odometer_sigma: float = 0.02
+    odometer_slip: float = 0.002
+    odometer_speed_sigma: float = 0.1
+    slip_gate: float = 4.0
+    slip_longest: float = 60.0
+    standstill_sigma: float = 0.02
+    standstill_time: float = 1.0
+    reverse_prior: float = 0.02
+    track_confidence: float = 0.95
+    coasting_after: float = 3.0
+    lost_sigma: float = 500.0
+    sigma_usable: float = 60.0
+    merge_distance: float = 1.0
+    prune_below: float = 1e-6
+    most_hypotheses: float = 16.0
+    gravity: float = 9.80665
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (np.isfinite(value) and value >= 0.0):
+                raise ValueError(f"setting {field.name} is {value}: it must be finite and not negative")
+
+    def packed(self) -> FloatArray:
+        """All values in the order of the fields, as the kernels read them."""
+        return np.array(astuple(self), np.float64)
+
+
+#: Index of each setting in `Settings.packed`, by name.
+SETTING = {field.name: i for i, field in enumerate(fields(Settings))}
