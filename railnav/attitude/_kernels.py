@@ -7,7 +7,7 @@ import math
 from numba import njit
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def multiply(a0, a1, a2, a3, b0, b1, b2, b3):
     """Hamilton product a b."""
     return (
@@ -18,7 +18,7 @@ def multiply(a0, a1, a2, a3, b0, b1, b2, b3):
     )
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def exponential(x, y, z):  # rad
     """Quaternion of a rotation vector; a series below 0.1 rad, exact to the last place."""
     square = 0.25 * (x * x + y * y + z * z)  # of the half angle
@@ -32,7 +32,7 @@ def exponential(x, y, z):  # rad
     return cosine, factor * x, factor * y, factor * z
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def rotate(q0, q1, q2, q3, x, y, z):
     """Vector q v q*, for a unit quaternion."""
     tx = 2.0 * (q2 * z - q3 * y)

@@ -1,4 +1,4 @@
-"""Inertial sensors and what can be made of them alone: error models, noise analysis.
+"""Inertial sensors and what can be made of them alone: error models, noise analysis, strapdown mechanization.
 
 Body axes b are forward, right, down; local axes n are north, east, down. `specific_force_b` is what an accelerometer measures,
 acceleration minus gravitation: at rest it points up with the size of gravity, so its third component is about -9.81 m/s^2 on a
@@ -9,17 +9,29 @@ ends at their time, as in `railnav.run.ImuStream`.
 from __future__ import annotations
 
 from railnav.inertial.allan import AllanCurve, NoiseParameters, allan_deviation, fit_allan
+from railnav.inertial.mechanization import (
+    EARTH_RATE,
+    GravityField,
+    NavigationState,
+    Trajectory,
+    mechanize,
+)
 from railnav.inertial.sensors import GRADES, SensorGrade, TriadModel, TriadSamples, misalignment_matrix, simulate_triad
 
 __all__ = [
+    "EARTH_RATE",
     "GRADES",
     "AllanCurve",
+    "GravityField",
+    "NavigationState",
     "NoiseParameters",
     "SensorGrade",
+    "Trajectory",
     "TriadModel",
     "TriadSamples",
     "allan_deviation",
     "fit_allan",
+    "mechanize",
     "misalignment_matrix",
     "simulate_triad",
 ]
