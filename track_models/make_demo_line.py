@@ -2,7 +2,7 @@
 
     python track_models/make_demo_line.py [track_models/demo_line.gpkg]
 
-The line is laid out from its alignment elements in `railnav.simulation.demo_line`; nothing is downloaded. What it consists of
+The line is laid out from its alignment elements in `railnav.simulation.bundled`; nothing is downloaded. What it consists of
 stands in track_models/demo_line.md.
 """
 

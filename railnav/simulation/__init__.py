@@ -1,6 +1,6 @@
 """Simulation: fictitious lines, trains that drive on a model, and the sensors they carry."""
 
-from railnav.simulation.demo_line import demo_line
+from railnav.simulation.bundled import demo_line
 from railnav.simulation.driving import Driving, Motion, drive
 from railnav.simulation.journey import Leg, Path, Stop, path_of
 from railnav.simulation.sensors import (

@@ -9,7 +9,7 @@ import pytest
 
 from railnav.geodesy.grid import choose_frame
 from railnav.simulation import demo_line
-from railnav.simulation.demo_line import JUMP, LENGTH, TRACK_DISTANCE
+from railnav.simulation.bundled import JUMP, LENGTH, TRACK_DISTANCE
 from railnav.track import End, NodeKind, TrackModel, validate
 from railnav.units import wrap_angle
 

@@ -242,3 +242,34 @@ def test_rotation_vector_round_trip():
     vectors = generator.standard_normal((50, 3)) * 0.3
     vectors[0] = 0.0
     np.testing.assert_allclose(rotation_vector(rotation_matrix(vectors)), vectors, atol=1e-12)
+
+
+def test_an_independent_simulator_agrees(shared_data):
+    """The IMU of sample_run, made elsewhere: the same motion gives its six signals, up to noise, bias and scale."""
+    from railnav.io.geojson import read_geojson
+    from railnav.io.run import read_run
+    from railnav.io.truth import read_truth
+
+    folder = shared_data / "sample_run"
+    if not folder.is_dir():
+        pytest.skip("sample_run is not among the real data")
+    truth, model, imu = read_truth(folder / "truth.csv"), read_geojson(folder / "network.geojson"), read_run(folder).imu
+    track = np.array([model.track_index(t) for t in truth.track_id])[truth.track]
+    points = model.at(track, np.clip(truth.offset, 0.0, model.lengths[track]))
+    sense = np.where(np.cos(points.heading - truth.heading) > 0.0, 1.0, -1.0)
+    pitch, roll = sense * np.arctan(points.gradient), sense * cant_angle(points.cant)
+    heading = points.heading + np.where(sense > 0.0, 0.0, math.pi)
+    direction = np.stack([np.cos(pitch) * np.cos(heading), np.cos(pitch) * np.sin(heading), -np.sin(pitch)], axis=-1)
+    attitude = attitude_matrix(roll, pitch, heading)
+    rate, force = interval_means(truth.time, truth.latitude, truth.height, truth.speed[:, None] * direction, attitude)
+    n = len(rate)
+    theirs_rate = imu.gyro[: 10 * n].reshape(n, 10, 3).mean(axis=1)
+    theirs_force = imu.specific_force[: 10 * n].reshape(n, 10, 3).mean(axis=1)
+    for axis, slope_within in ((0, 0.05), (1, 0.1), (2, 0.02)):
+        slope, bias = np.polyfit(rate[:, axis], theirs_rate[:, axis], 1)
+        assert slope == pytest.approx(1.0, abs=slope_within)
+        assert abs(bias) < 1e-3
+    for axis, slope_within in ((0, 0.02), (1, 0.02), (2, 0.1)):
+        slope, _ = np.polyfit(force[:, axis], theirs_force[:, axis], 1)
+        assert slope == pytest.approx(1.0, abs=slope_within)
+    assert np.abs((theirs_force - force).mean(axis=0)).max() < 0.08
