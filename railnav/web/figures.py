@@ -110,7 +110,7 @@ def _axis(title: str, **more: Any) -> dict[str, Any]:
 def _layout(height: int, **more: Any) -> dict[str, Any]:
     return {
         "height": height,
-        "margin": {"l": 68, "r": 20, "t": 36, "b": 48},
+        "margin": {"l": 68, "r": 20, "t": 66, "b": 48},
         "paper_bgcolor": "rgba(0,0,0,0)",
         "plot_bgcolor": "rgba(0,0,0,0)",
         "font": {
@@ -179,17 +179,18 @@ def plan(
             _line("tracks", x, y, TRACK, text=text, hovertemplate="track %{text}<extra></extra>", connectgaps=False)
         )
         data.append(_nodes(model, east0, north0))
-    for k, (name, easting, northing) in enumerate(surveys):
-        rows = np.linspace(0, len(easting) - 1, min(len(easting), 1500)).astype(np.int64)
+    if surveys:
+        parts = [(name, np.linspace(0, len(e) - 1, min(len(e), 1500)).astype(np.int64), e, n) for name, e, n in surveys]
         data.append(
             {
                 "type": "scatter",
                 "mode": "markers",
-                "name": escape(name),
-                "x": (easting[rows] - east0) / 1e3,
-                "y": (northing[rows] - north0) / 1e3,
-                "marker": {"size": 3, "opacity": 0.55, "color": PALETTE[(k + 3) % len(PALETTE)]},
-                "hoverinfo": "name",
+                "name": "survey fixes",
+                "x": np.concatenate([(e[rows] - east0) / 1e3 for _, rows, e, _ in parts]),
+                "y": np.concatenate([(n[rows] - north0) / 1e3 for _, rows, _, n in parts]),
+                "text": [escape(name) for name, rows, _, _ in parts for _ in rows],
+                "marker": {"size": 3, "opacity": 0.55, "color": PALETTE[3]},
+                "hovertemplate": "%{text}<extra></extra>",
                 "visible": "legendonly",
             }
         )
@@ -413,17 +414,26 @@ def _uncertainty(x: FloatArray, solution: Solution, rows: IntArray) -> list[dict
     """Two standard deviations as a band around zero, and the protection level on both sides."""
     sigma, level = 2.0 * solution.sigma_along[rows], solution.protection_level_along[rows]
     edge = {"color": LIMIT, "width": 1.1}
+    around: list[FloatArray] = []
+    up_and_back: list[FloatArray] = []
+    gap = np.array([np.nan])
+    for known, a, b in _runs_of(np.isfinite(sigma).astype(np.int64)):
+        if known:
+            around += [x[a:b], x[a:b][::-1], gap]
+            up_and_back += [sigma[a:b], -sigma[a:b][::-1], gap]
     return [
-        _line("", x, -sigma, BAND, line={"width": 0}, hoverinfo="skip", showlegend=False),
         _line(
             "two sigma",
-            x,
-            sigma,
+            np.concatenate(around or [gap]),
+            np.concatenate(up_and_back or [gap]),
             BAND,
             line={"width": 0},
-            fill="tonexty",
+            fill="toself",
             fillcolor=BAND,
-            hovertemplate="%{y:.3f} m<extra>two sigma</extra>",
+            hoverinfo="skip",
+        ),
+        _line(
+            "", x, sigma, BAND, line={"width": 0}, showlegend=False, hovertemplate="%{y:.3f} m<extra>two sigma</extra>"
         ),
         _line(
             "protection level", x, level, LIMIT, line=edge, hovertemplate="%{y:.3f} m<extra>protection level</extra>"
@@ -649,7 +659,9 @@ def integrity(evaluation: Evaluation) -> Figure:
     worst = known[np.argsort((error - level)[known])[::-1][:200]]
     even = known[np.linspace(0, len(known) - 1, min(len(known), 2500)).astype(np.int64)] if len(known) else known
     shown = np.union1d(worst, even)
-    top = 1.08 * float(max(np.max(error[known], initial=1e-3), np.max(level[known], initial=1e-3)))
+    high = 1.08 * float(np.max(level[known], initial=1e-3))
+    wide = min(high, 1.6 * float(np.max(error[known], initial=1e-3))) if len(known) else high
+    wide = max(wide, 1.08 * float(np.max(error[known], initial=1e-3)))
     over = error[shown] > level[shown]
     data = [
         {
@@ -664,12 +676,12 @@ def integrity(evaluation: Evaluation) -> Figure:
         for name, chosen, colour in (("bounded", ~over, ESTIMATE), ("error beyond its bound", over, WRONG))
         if chosen.any()
     ]
-    data.append(_line("error = bound", [0, top], [0, top], SOFT, line={"width": 1, "dash": "dash"}, hoverinfo="skip"))
+    data.append(_line("error = bound", [0, wide], [0, wide], SOFT, line={"width": 1, "dash": "dash"}, hoverinfo="skip"))
     layout = _layout(
         440,
         hovermode="closest",
-        xaxis=_axis("size of the error along the track, m", range=[0, top]),
-        yaxis=_axis("protection level, m", range=[0, top]),
+        xaxis=_axis("size of the error along the track, m", range=[0, wide]),
+        yaxis=_axis("protection level, m", range=[0, max(high, wide)]),
     )
     return Figure("integrity", data, layout)
 
@@ -692,14 +704,14 @@ def profile(model: TrackModel, *, tracks: int = len(PALETTE)) -> Figure:
     data = []
     for k, t in enumerate(longest):
         knots = slice(int(model.knot_start[t]), int(model.knot_start[t + 1]))
-        sigma = cross_sigma(model, knots) * 1e3
+        sigma = cross_sigma(model, knots)
         rows = thin(2400 if len(longest) <= 4 else 1200, model.curvature[knots], sigma)
         x = model.offset[knots][rows] / 1e3
         name, colour = escape(model.track_id[t]), PALETTE[k % len(PALETTE)]
         for axis, values, form in (
             ("y", model.curvature[knots] * 1e3, "%{y:.3f} /km"),
             ("y2", model.height[knots], "%{y:.2f} m"),
-            ("y3", sigma, "%{y:.1f} mm"),
+            ("y3", sigma, "%{y:.4f} m"),
         ):
             data.append(
                 _line(
@@ -720,7 +732,7 @@ def profile(model: TrackModel, *, tracks: int = len(PALETTE)) -> Figure:
         xaxis=_axis("offset on the track, km", anchor="y3"),
         yaxis=_axis("curvature, 1/km", domain=[0.7, 1.0]),
         yaxis2=_axis("height, m", domain=[0.36, 0.64]),
-        yaxis3=_axis("sigma across, mm", domain=[0.0, 0.3], rangemode="tozero"),
+        yaxis3=_axis("sigma across, m", domain=[0.0, 0.3], type="log", dtick=1),
     )
     return Figure("profile", data, layout)
 

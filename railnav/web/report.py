@@ -174,8 +174,8 @@ def run_rows(build: Mapping[str, Any]) -> tuple[Sequence[str], list[list[str]], 
     rows = []
     for run in build.get("runs", []):
         fixes, offset = run["fixes"], run.get("frame_offset") or {}
-        reasons = ", ".join(
-            f"{reason} {entry['count']:,}" if isinstance(entry, Mapping) else f"{reason} {entry:,}"
+        reasons = "; ".join(
+            f"{entry['count'] if isinstance(entry, Mapping) else entry:,} {reason}"
             for reason, entry in fixes.get("rejected", {}).items()
         )
         rows.append(
@@ -215,7 +215,7 @@ def track_rows(build: Mapping[str, Any]) -> tuple[Sequence[str], list[list[str]]
 
 
 def _signed(value: float | None) -> str:
-    return words.NOTHING if value is None else f"{value:+.2f} m"
+    return words.NOTHING if value is None else f"{'+' if value > 0 else ''}{words.length(value)}"
 
 
 def build_sections(build: Mapping[str, Any]) -> list[Section]:
@@ -481,7 +481,7 @@ def demo_page(
     evaluation, smoothed : Evaluation
         Of the filtered and of the smoothed solution.
     axis_error : mapping
-        `axis_rms_m` and `axis_max_m` of the built axis against the true one.
+        `axis_rms_m` and `axis_max_m` of the built axis against the true one under open sky, `axis_tunnel_max_m` in tunnels.
     steps : sequence of (name, seconds)
         What was done, and how long it took.
     commands : sequence of str
@@ -507,16 +507,17 @@ def demo_page(
     lead = [
         f"Everything on this page is simulated. A survey car ran {words.count(len(surveys), 'time')} over a fictitious double line; "
         f"from its {fixes:,} satellite fixes railnav built a reference track model of {words.count(len(model.track_id), 'track')}, "
-        f"{words.length(float(model.lengths.sum()), 4)} in all, whose axis lies within {words.length(axis_error.get('axis_rms_m'), 2)} "
-        f"(RMS) of the true one. A train in service then ran {words.length(length)} over it with an everyday receiver, an odometer "
-        f"and an inertial sensor, through {words.count(len(silent), 'stretch', 'stretches')} without satellites.",
+        f"{words.length(float(model.lengths.sum()), 4)} in all. Its axis lies within {words.length(axis_error.get('axis_rms_m'), 2)} "
+        f"(RMS) of the true one under open sky; in the tunnels, where the survey saw no satellites, it is off by up to "
+        f"{words.length(axis_error.get('axis_tunnel_max_m'), 2)}, and says so. A train in service then ran {words.length(length)} over "
+        f"the model with an everyday receiver, an odometer and an inertial sensor, {words.count(len(silent), 'time')} without satellites.",
         *evaluation_words(evaluation),
     ]
     cards = [
         Card(
             "Axis of the built model",
             words.length(axis_error.get("axis_rms_m"), 2),
-            f"RMS from the true axis; worst: {words.length(axis_error.get('axis_max_m'), 2)}",
+            f"RMS from the true axis under open sky; worst: {words.length(axis_error.get('axis_max_m'), 2)}",
         ),
         *evaluation_cards(evaluation),
     ]

@@ -21,8 +21,7 @@ def _stock(tmp_path_factory: pytest.TempPathFactory) -> Path:
     model.to_file(folder / "line.gpkg")
     write_geojson(model, folder / "line.geojson")
     leg = Leg(("77R-01", "77R-02", "77R-03"), start=60.0, finish=900.0)
-    outfit = replace(SERVICE, imu=None)
-    run, truth = simulate(model, leg, seed=3, outfit=outfit, run_id="service")
+    run, truth = simulate(model, leg, seed=3, outfit=SERVICE, run_id="service")
     write_run(run, folder / "service")
     write_truth(truth, folder / "truth.csv")
     for k in range(2):
