@@ -137,9 +137,9 @@ def fit_alignment(
 
     # intervals of integration end at the vertices and are at most 5 m long
     pieces = np.maximum(1, np.ceil(np.diff(p) / 5.0).astype(int))
-    edges = np.append(
-        np.concatenate([np.linspace(a, b, m, endpoint=False) for a, b, m in zip(p, p[1:], pieces, strict=False)]), p[-1]
-    )
+    before = np.append(0, np.cumsum(pieces))
+    part = np.arange(before[-1]) - np.repeat(before[:-1], pieces)
+    edges = np.append(np.repeat(p[:-1], pieces) + part * np.repeat(np.diff(p) / pieces, pieces), p[-1])
     node, weight = np.polynomial.legendre.leggauss(5)
     half = 0.5 * np.diff(edges)
     lengths = half * (speed(edges[:-1, None] + half[:, None] * (1.0 + node)) @ weight)
