@@ -525,3 +525,32 @@ def test_killed_save_leaves_one_whole_model(tmp_path):
         child.stdout.close()
         model = read_model(path)
         assert any(np.array_equal(model.easting, easting) for easting in eastings)
+
+
+README = Path(__file__).parents[2] / "track_models" / "README.md"
+
+
+def test_schema_is_described_column_by_column(tmp_path, small_model):
+    write_model(small_model, tmp_path / "m.gpkg")
+    text = README.read_text(encoding="utf-8")
+    for (table,) in ask(tmp_path / "m.gpkg", "SELECT table_name FROM gpkg_contents"):
+        chapter = text.split(f"### `{table}`")[1].split("\n#")[0]
+        for row in ask(tmp_path / "m.gpkg", f"PRAGMA table_info({table})"):
+            if table != "railnav_meta" and row[1] not in ("fid", "geom"):
+                assert f"`{row[1]}`" in chapter, f"{table}.{row[1]}"
+    for (key,) in ask(tmp_path / "m.gpkg", "SELECT key FROM railnav_meta"):
+        assert f"`{key}`" in text, key
+    assert f"## Schema, version {geopackage.SCHEMA_VERSION}\n" in text
+
+
+def test_example_of_the_schema_runs(tmp_path, small_model, monkeypatch):
+    write_model(small_model, tmp_path / "line.gpkg")
+    monkeypatch.chdir(tmp_path)
+    code = README.read_text(encoding="utf-8").split("```python\n")[1].split("```")[0]
+    names = {}
+    monkeypatch.setattr(
+        sqlite3, "connect", lambda path, connect=sqlite3.connect: names.setdefault("open", connect(path))
+    )
+    exec(code, names)
+    names["open"].close()
+    np.testing.assert_array_equal(names["easting"], small_model.easting[:12])
