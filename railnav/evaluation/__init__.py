@@ -1,7 +1,7 @@
 """Evaluation: a solution beside the truth. Errors along and across, track selection, consistency, integrity."""
 
 from railnav.evaluation.comparison import Comparison, compare
-from railnav.evaluation.consistency import Consistency, consistency, effective_samples
+from railnav.evaluation.consistency import Consistency, consistency, effective_samples, pooled
 from railnav.evaluation.jumps import Jump, Jumps, find_jumps
 from railnav.evaluation.known import truth_as_solution
 from railnav.evaluation.scores import (
@@ -30,5 +30,6 @@ __all__ = [
     "effective_samples",
     "evaluate",
     "find_jumps",
+    "pooled",
     "truth_as_solution",
 ]

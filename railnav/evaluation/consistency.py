@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -150,4 +151,53 @@ def consistency(error: FloatArray, sigma: FloatArray, time: FloatArray, *, confi
         correlation_time=length * spacing,
         confidence=confidence,
         coverage=(float((size <= 1.0).mean()), float((size <= 2.0).mean()), float((size <= 3.0).mean())),
+    )
+
+
+def pooled(parts: Sequence[Consistency]) -> Consistency:
+    """Judge several independent runs together: one run with slow errors can hardly be told from an honest one, thirty can.
+
+    Means are weighted by the epochs of each run (weighting by effective samples would favour runs that happened to wander little);
+    the bounds come from 1 / sum(w^2 / effective) samples, w the weights.
+
+    Parameters
+    ----------
+    parts : sequence of Consistency
+        Of independent runs, at one confidence; those without epochs are passed over.
+
+    Returns
+    -------
+    Consistency
+        The correlation time is the weighted mean.
+
+    Examples
+    --------
+    >>> one = consistency(np.array([1.0, -1.0]), np.ones(2), np.array([0.0, 1.0]))
+    >>> pooled([one, one]).effective / one.effective
+    2.0
+    """
+    from scipy.stats import chi2
+
+    known = [p for p in parts if p.effective is not None]
+    confidence = parts[0].confidence if parts else 0.95
+    if not known:
+        return Consistency(0, None, None, None, None, None, confidence, None)
+    count, effective = np.array([(p.count, p.effective) for p in known], float).T
+    weight = count / count.sum()
+    total = float(1.0 / (weight**2 / effective).sum())
+    tail = 0.5 * (1.0 - confidence)
+
+    def mean(values: Sequence[float | None]) -> float:
+        return float((np.array(values, float) * weight).sum())
+
+    shares = [p.coverage for p in known if p.coverage is not None]
+    return Consistency(
+        count=sum(p.count for p in known),
+        nees=mean([p.nees for p in known]),
+        lower=float(chi2.ppf(tail, total) / total),
+        upper=float(chi2.ppf(1.0 - tail, total) / total),
+        effective=total,
+        correlation_time=mean([p.correlation_time for p in known]),
+        confidence=confidence,
+        coverage=(mean([c[0] for c in shares]), mean([c[1] for c in shares]), mean([c[2] for c in shares])),
     )

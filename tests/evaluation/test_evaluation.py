@@ -278,6 +278,22 @@ def test_coloured_errors_widen_the_bounds(model):
     assert c.correlation_time == pytest.approx(40.0, rel=0.9)
 
 
+def test_runs_pooled_tell_what_one_run_cannot():
+    """Errors 1.5 times too large for their sigma: one slow run lets it pass, forty together do not."""
+    from railnav.evaluation import consistency, pooled
+
+    generator, time = np.random.default_rng(3), np.arange(0.0, 600.0, 0.5)
+    runs = [gauss_markov(generator, len(time), 0.5, 1.0, 60.0) for _ in range(40)]
+    honest = pooled([consistency(r, np.ones(len(r)), time) for r in runs])
+    sure = [consistency(1.5 * r, np.ones(len(r)), time) for r in runs]
+    assert honest.inside
+    assert honest.count == 40 * len(time)
+    assert not pooled(sure).inside
+    assert pooled(sure).nees == pytest.approx(2.25 * honest.nees)
+    assert np.mean([bool(c.inside) for c in sure]) > 0.3
+    assert pooled([]).nees is None
+
+
 def test_json_is_plain(model, ride):
     e = evaluate(truth_as_solution(ride, model, along=1.0), ride, model=model)
     text = json.dumps(e.to_dict(), allow_nan=False)
