@@ -9,6 +9,7 @@ Modules
 atomic : a save leaves the old file or the new one, whole.
 tables : CSV and Parquet columns, with refusals.
 run, truth, solution : what a train recorded, where it was, where railnav says it was.
+container : a GeoPackage as a container of layers and tables.
 geopackage : the store of a reference track model.
 geojson, elements : track networks to import, and back.
 """

@@ -221,8 +221,9 @@ def create(path: str | Path, crs_wkt: str) -> Iterator[Container]:
     Raises
     ------
     InputError
-        The file cannot be written.
+        The file cannot be written, or another program has the one that it replaces open.
     """
+    _refuse_open(path)
     with atomic_path(path) as draft:
         connection = sqlite3.connect(draft, isolation_level=None)
         try:
@@ -230,11 +231,25 @@ def create(path: str | Path, crs_wkt: str) -> Iterator[Container]:
             connection.execute("PRAGMA synchronous = OFF")  # atomic_path flushes it once
             yield Container(connection, crs_wkt)
             connection.execute("COMMIT")
+            _refuse_open(path)
         except sqlite3.Error as error:
             cause = f"cannot be written ({error})"
             raise InputError(cause, file=path, remedy="choose another place or make room") from error
         finally:
             connection.close()
+
+
+def _refuse_open(path: str | Path) -> None:
+    """Refuse a target with a log beside it: SQLite would play the old file's log into the new one."""
+    for ending in ("-wal", "-journal"):
+        log = Path(f"{path}{ending}")
+        try:
+            left = log.stat().st_size
+        except (OSError, ValueError):
+            continue
+        if left:
+            cause = f"the file is open in another program, or was when that crashed ({log.name} stands beside it)"
+            raise InputError(cause, file=path, remedy=f"close it there, in QGIS for instance, or remove {log.name}")
 
 
 @contextmanager

@@ -437,6 +437,23 @@ def test_file_in_use_is_refused(tmp_path, small_model, monkeypatch):
     assert read_model(path).track_id == small_model.track_id
 
 
+def test_file_open_elsewhere_is_read_with_its_log_and_not_replaced(tmp_path, small_model):
+    path = tmp_path / "m.gpkg"
+    write_model(small_model, path)
+    other = sqlite3.connect(path, isolation_level=None)  # as QGIS keeps it open
+    other.execute("PRAGMA journal_mode = WAL")
+    other.execute("UPDATE tracks SET name = 'edited' WHERE fid = 1")
+    assert read_model(path).name[0] == "edited"
+    with pytest.raises(
+        InputError, match=r"m.gpkg: the file is open in another program, .* \(m.gpkg-wal stands beside it\)"
+    ):
+        write_model(small_model, path)
+    assert read_model(path).name[0] == "edited"
+    other.close()
+    write_model(small_model, path)
+    assert read_model(path).name[0] == ""
+
+
 def test_reading_changes_nothing(tmp_path, small_model):
     path = tmp_path / "m.gpkg"
     write_model(small_model, path)
