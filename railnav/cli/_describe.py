@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import click
+
 from railnav.cli._terminal import print_facts, print_table
 from railnav.web import words
 
@@ -75,10 +77,6 @@ def describe_model(model: TrackModel) -> dict[str, Any]:
     }
 
 
-def _accuracy(accuracy: float) -> str:
-    return f"accurate to {words.length(accuracy, 2)}" if accuracy > 0 else "exact, no datum shift"
-
-
 def _radius_words(radius: float | None) -> str:
     return words.length(radius) if radius is not None and radius < 2e4 else "straight"
 
@@ -109,7 +107,7 @@ def print_model(facts: dict[str, Any], title: str) -> None:
             "movements": f"{facts['movements']} permitted",
             "mileposts": facts["mileposts"] or "",
             "plane": facts["crs"],
-            "transformation": f"{facts['operation']} ({_accuracy(facts['operation_accuracy_m'])})",
+            "transformation": f"{facts['operation']} ({words.accuracy(facts['operation_accuracy_m'])})",
             "made by": _maker(provenance),
         },
     )
@@ -324,8 +322,19 @@ def print_build(model: TrackModel, title: str) -> None:
             "datum": (build.get("datum") or {}).get("rule", ""),
         },
     )
-    for name, (columns, rows, left) in (("Runs", report.run_rows(build)), ("Tracks", report.track_rows(build))):
-        print_table(name, columns, rows, left=left)
+    columns, rows, left = report.run_rows(build)
+    why = columns.index("rejected because")
+    shorter = [[cell for k, cell in enumerate(row) if k != why] for row in [list(columns), *rows]]
+    print_table("Runs", shorter[0], shorter[1:], left=left - 1)
+    if any(report.rejected(run) for run in build["runs"]):
+        click.secho("Rejected fixes", bold=True)
+        for run in build["runs"]:
+            reasons = report.rejected(run)
+            if reasons:
+                click.echo(f"  {run['id']}: {'; '.join(reasons)}")
+        click.echo()
+    columns, rows, left = report.track_rows(build)
+    print_table("Tracks", columns, rows, left=left)
     print_warnings(build.get("warnings", []))
 
 

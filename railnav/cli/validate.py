@@ -21,7 +21,7 @@ def command(ctx: click.Context, file: Path, as_json: bool) -> None:
 
     \b
     Example:
-      railnav validate demo/line.gpkg
+      railnav validate demo/bundled.gpkg
     """  # noqa: D301
     from railnav.cli import _files
     from railnav.cli._terminal import print_json

@@ -727,12 +727,14 @@ def profile(model: TrackModel, *, tracks: int = len(PALETTE)) -> Figure:
                     line={"width": 1.3},
                 )
             )
+    size = np.abs(model.curvature) * 1e3
+    steep = 1.1 * max(0.5, float(min(size.max(), 1.5 * np.quantile(size, 0.99))))
     layout = _layout(
         660,
         xaxis=_axis("offset on the track, km", anchor="y3"),
-        yaxis=_axis("curvature, 1/km", domain=[0.7, 1.0]),
+        yaxis=_axis("curvature, 1/km", domain=[0.7, 1.0], range=[-steep, steep]),
         yaxis2=_axis("height, m", domain=[0.36, 0.64]),
-        yaxis3=_axis("sigma across, m", domain=[0.0, 0.3], type="log", dtick=1),
+        yaxis3=_axis("sigma across, m", domain=[0.0, 0.3], type="log"),
     )
     return Figure("profile", data, layout)
 

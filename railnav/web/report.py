@@ -122,7 +122,7 @@ def build_page(model: TrackModel) -> str:
     ]
     cards = [
         Card("Tracks", f"{len(model.track_id):,}", words.length(total, 5)),
-        Card("Plane", model.frame.name, f"transformation to {words.length(model.frame.accuracy, 2)}"),
+        Card("Plane", model.frame.name, words.accuracy(model.frame.accuracy)),
     ]
     sections = [
         Section("The line in plan", "Drag to pan, zoom with the tools at the upper right.", [figures.plan(model)]),
@@ -157,6 +157,14 @@ def build_words(build: Mapping[str, Any]) -> str:
     return text
 
 
+def rejected(run: Mapping[str, Any]) -> list[str]:
+    """Say how many fixes of a run of a build were rejected, and why."""
+    return [
+        f"{entry['count'] if isinstance(entry, Mapping) else entry:,} {reason}"
+        for reason, entry in run["fixes"].get("rejected", {}).items()
+    ]
+
+
 def run_rows(build: Mapping[str, Any]) -> tuple[Sequence[str], list[list[str]], int]:
     """Tabulate the runs of a build: what was used, what was rejected and why, how far its positions stand apart."""
     columns = (
@@ -174,10 +182,7 @@ def run_rows(build: Mapping[str, Any]) -> tuple[Sequence[str], list[list[str]], 
     rows = []
     for run in build.get("runs", []):
         fixes, offset = run["fixes"], run.get("frame_offset") or {}
-        reasons = "; ".join(
-            f"{entry['count'] if isinstance(entry, Mapping) else entry:,} {reason}"
-            for reason, entry in fixes.get("rejected", {}).items()
-        )
+        reasons = "; ".join(rejected(run))
         rows.append(
             [
                 str(run["id"]),

@@ -119,3 +119,14 @@ def count(value: int, one: str, many: str = "") -> str:
     ('1 run', '12,345 fixes')
     """
     return f"{value:,} {one if value == 1 else many or one + 's'}"
+
+
+def accuracy(value: float) -> str:
+    """Write the accuracy of a transformation given in metres; 0 is a conversion without a change of datum.
+
+    Examples
+    --------
+    >>> accuracy(0.0), accuracy(1.5)
+    ('exact, no datum shift', 'accurate to 1.5 m')
+    """
+    return f"accurate to {length(value, 2)}" if value > 0 else "exact, no datum shift"
