@@ -242,10 +242,10 @@ def create(path: str | Path, crs_wkt: str) -> Iterator[Container]:
 def _refuse_open(path: str | Path) -> None:
     """Refuse a target with a log beside it: SQLite would play the old file's log into the new one."""
     for ending in ("-wal", "-journal"):
-        log = Path(f"{path}{ending}")
         try:
+            log = Path(f"{Path(path).resolve()}{ending}")
             left = log.stat().st_size
-        except (OSError, ValueError):
+        except (OSError, ValueError, RuntimeError):  # none there, or a path that atomic_path refuses
             continue
         if left:
             cause = f"the file is open in another program, or was when that crashed ({log.name} stands beside it)"
