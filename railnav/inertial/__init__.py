@@ -1,4 +1,5 @@
-"""Inertial sensors and what can be made of them alone: error models, noise analysis, strapdown mechanization.
+"""Inertial sensors and what can be made of them alone: error models, noise analysis, calibration, strapdown
+mechanization.
 
 Body axes b are forward, right, down; local axes n are north, east, down. `specific_force_b` is what an accelerometer measures,
 acceleration minus gravitation: at rest it points up with the size of gravity, so its third component is about -9.81 m/s^2 on a
@@ -9,6 +10,23 @@ ends at their time, as in `railnav.run.ImuStream`.
 from __future__ import annotations
 
 from railnav.inertial.allan import AllanCurve, NoiseParameters, allan_deviation, fit_allan
+from railnav.inertial.calibration import (
+    Position,
+    Solvability,
+    TemperaturePolynomial,
+    TriadCalibration,
+    advise_positions,
+    advise_turns,
+    finite_rotation,
+    fit_temperature,
+    multi_position,
+    position_mean,
+    six_position,
+    solvability,
+    turned_force,
+    turned_rate,
+    vector_calibration,
+)
 from railnav.inertial.mechanization import (
     EARTH_RATE,
     GravityField,
@@ -25,13 +43,28 @@ __all__ = [
     "GravityField",
     "NavigationState",
     "NoiseParameters",
+    "Position",
     "SensorGrade",
+    "Solvability",
+    "TemperaturePolynomial",
     "Trajectory",
+    "TriadCalibration",
     "TriadModel",
     "TriadSamples",
+    "advise_positions",
+    "advise_turns",
     "allan_deviation",
+    "finite_rotation",
     "fit_allan",
+    "fit_temperature",
     "mechanize",
     "misalignment_matrix",
+    "multi_position",
+    "position_mean",
     "simulate_triad",
+    "six_position",
+    "solvability",
+    "turned_force",
+    "turned_rate",
+    "vector_calibration",
 ]
