@@ -87,7 +87,10 @@ def pin_operation(source: pyproj.CRS, target: pyproj.CRS, extent: Extent) -> tup
     from pyproj.transformer import TransformerGroup
 
     bound = target.is_bound or source.is_bound
-    words = f"{_title(source)} to {_title(target)}"
+
+    def words() -> str:  # looking a system up in the registry takes 0.1 s: only to refuse
+        return f"{_title(source)} to {_title(target)}"
+
     # PROJ takes an area wider than the data: an operation must hold a little beyond the outermost fix
     area: Any = AreaOfInterest(
         wrapped_deg(extent.west - 0.01),
@@ -103,10 +106,10 @@ def pin_operation(source: pyproj.CRS, target: pyproj.CRS, extent: Extent) -> tup
             )
     except IndexError as error:  # pyproj's way of saying that only time-specific operations were left
         raise CrsError(
-            f"no usable transformation from {words} about {extent}: PROJ cannot run it; {_remedy(target)}"
+            f"no usable transformation from {words()} about {extent}: PROJ cannot run it; {_remedy(target)}"
         ) from error
     except ProjError as error:
-        raise CrsError(f"PROJ has no transformation from {words}: {shortened(error)}") from error
+        raise CrsError(f"PROJ has no transformation from {words()}: {shortened(error)}") from error
     why = "PROJ has none that it can run"
     for transformer in group.transformers:
         definition = str(transformer.definition)
@@ -127,7 +130,7 @@ def pin_operation(source: pyproj.CRS, target: pyproj.CRS, extent: Extent) -> tup
             return definition, operation, max(float(transformer.accuracy), 0.0)
     if not group.transformers and group.unavailable_operations:
         why = "it would need grid files"
-    raise CrsError(f"no usable transformation from {words} about {extent}: {why}; {_remedy(target)}")
+    raise CrsError(f"no usable transformation from {words()} about {extent}: {why}; {_remedy(target)}")
 
 
 def _title(system: pyproj.CRS) -> str:
