@@ -18,6 +18,7 @@ IntArray = NDArray[np.int64]
 
 #: A pivot this small against the row it would come from counts as empty (rail 15.8).
 PIVOT_TOLERANCE = 1e-12
+EMPTY = PIVOT_TOLERANCE * PIVOT_TOLERANCE
 
 #: A variance this small, given the ones before it, against itself: the covariance is singular.
 VARIANCE_TOLERANCE = 1e-13
@@ -83,36 +84,6 @@ def insert_rows_kernel(W: FloatArray, rows: FloatArray, count: int) -> tuple[flo
     return total, redundant
 
 
-@njit(cache=True, inline="always")
-def _reflect(W: FloatArray, pivot: int, column: int, first: int, last: int, width: int) -> None:
-    """Clear a column of rows first..last-1 against the pivot row by one reflection (as q rotations, with one square root)."""
-    # W: work array, overwritten; its last row is scratch; the pivot row's element is >= 0 and stays so
-    scratch = W.shape[0] - 1
-    s = 0.0
-    for i in range(first, last):
-        s += W[i, column] * W[i, column]
-    if s != 0.0:
-        r = W[pivot, column]
-        h = np.sqrt(r * r + s)
-        inverse = 1.0 / h
-        g = 1.0 / (h + r)
-        W[pivot, column] = h
-        for c in range(column + 1, width):
-            W[scratch, c] = r * W[pivot, c]
-        for i in range(first, last):
-            a = W[i, column]
-            for c in range(column + 1, width):
-                W[scratch, c] += a * W[i, c]
-        for c in range(column + 1, width):
-            t = W[scratch, c] * inverse
-            W[scratch, c] = (W[pivot, c] + t) * g
-            W[pivot, c] = t
-        for i in range(first, last):
-            a = W[i, column]
-            for c in range(column + 1, width):
-                W[i, c] -= a * W[scratch, c]
-
-
 # ---------------------------------------------------------------- the chain, forward
 
 _READ_ONLY = (
@@ -133,7 +104,7 @@ def forward_kernel(size: int) -> Callable[..., int]:
         f3, f2, i1, f3, f3, f2, i1, int64, out_f2, f1, out_f3, out_f1, out_i1, out_b1, out_f1, out_i1, out_f2
     )  # fmt: skip
 
-    @njit(signature, cache=True)
+    @njit(signature, cache=True, error_model="numpy")
     def forward(
         H: FloatArray,
         z: FloatArray,
@@ -162,95 +133,88 @@ def forward_kernel(size: int) -> Callable[..., int]:
         # filtered (N | 0, n), NaN while the triangle is singular. Returns the first broken link, or -1
         n = size if size > 0 else H.shape[2]
         w = 2 * n + 1
-        epochs = z.shape[0]
-        links = link_counts.shape[0]
-        m = H.shape[1]
-        q = M.shape[1]
         H_step = 1 if H.shape[0] > 1 else 0
         M_step = 1 if M.shape[0] > 1 else 0
         L_step = 1 if L.shape[0] > 1 else 0
         u_step = 1 if u.shape[0] > 1 else 0
+        links = link_counts.shape[0]
         store = records.shape[0] > 0
         estimate = filtered.shape[0] > 0
         gate = limits.shape[0] > 0
         broken = -1
-        W = np.zeros((n + max(m, q, n) + 1, w))  # work array; the last row is scratch
-        slow = np.zeros((2 * n, w))
-        slow_rows = np.zeros((q, w))
-        slow_triangle = np.zeros((n, n + 1))
-        slow_observations = np.zeros((m, n + 1))
-        for k in range(epochs):
+        # Rows 0..n-1 hold the epoch that goes, rows n..2n-1 the epoch that comes, R = D^(1/2) (I + T): W. M. Gentleman's
+        # rotations without square roots. A row waits for one division a column, and rows follow each other one column behind,
+        # which is twice as fast as rotations or reflections with square roots. The new row of T is written as the weighted
+        # mean it is (four multiplications): T + take (a - a_j T) would lose digits when a strong row meets a weak pivot.
+        # The loop stands here twice because numba's inlining costs a third of the speed.
+        D = np.zeros(2 * n)
+        T = np.zeros((2 * n, w))
+        D_kept = np.zeros(n)
+        T_kept = np.zeros((n, n + 1))
+        row = np.zeros(w)
+        for i in range(n):
+            r = triangle[i, i]
+            if r != 0.0:
+                D[n + i] = r * r
+                for c in range(i + 1, n + 1):
+                    T[n + i, n + c] = triangle[i, c] / r
+        for k in range(z.shape[0]):
             link = k - 1 + lead
             if 0 <= link < links:
-                # [R 0 | b] over the rows [M L | u]
-                full = True
                 for i in range(n):
-                    for c in range(i, n):
-                        W[i, c] = triangle[i, c]
+                    D[i] = D[n + i]
+                    D[n + i] = 0.0  # empty; what its row holds is not read until a necessary row fills it
+                    for c in range(i + 1, n):
+                        T[i, c] = T[n + i, n + c]
+                    T[i, 2 * n] = T[n + i, 2 * n]
                     for c in range(n, 2 * n):
-                        W[i, c] = 0.0
-                    W[i, 2 * n] = triangle[i, n]
-                    full = full and triangle[i, i] > 0.0
-                used = 0
-                scale2 = 0.0
-                for i in range(link_counts[link]):
-                    size2 = 0.0
+                        T[i, c] = 0.0
+                total = 0.0
+                redundant = 0
+                for r in range(link_counts[link]):
+                    norm2 = 0.0
                     for c in range(n):
-                        W[n + used, c] = M[link * M_step, i, c]
-                        W[n + used, n + c] = L[link * L_step, i, c]
+                        row[c] = M[link * M_step, r, c]
+                        row[n + c] = L[link * L_step, r, c]
                     for c in range(2 * n):
-                        size2 += W[n + used, c] * W[n + used, c]
-                    if size2 != 0.0:  # a row of zeros is absent
-                        W[n + used, 2 * n] = u[link * u_step, i]
-                        scale2 += size2
-                        used += 1
-                if full and used >= n:
-                    for j in range(n):
-                        _reflect(W, j, j, n, n + used, w)
-                    for j in range(n):
-                        if W[n + j, n + j] < 0.0:
-                            for c in range(n + j, w):
-                                W[n + j, c] = -W[n + j, c]
-                        _reflect(W, n + j, n + j, n + j + 1, n + used, w)
-                        pivot = W[n + j, n + j]
-                        full = full and pivot * pivot > PIVOT_TOLERANCE * PIVOT_TOLERANCE * scale2
-                else:
-                    full = False
-                if full:
-                    total = 0.0
-                    for i in range(2 * n, n + used):
-                        total += W[i, 2 * n] * W[i, 2 * n]
-                    link_nis[link] = total
-                    link_dof[link] = used - n
-                    for i in range(n):
-                        for c in range(i, n):
-                            triangle[i, c] = W[n + i, n + c]
-                        triangle[i, n] = W[n + i, 2 * n]
-                else:  # a singular start, few rows or weak ones: row by row, necessary rows fill empty pivots
-                    for i in range(n):
-                        for c in range(w):
-                            slow[i, c] = 0.0
-                            slow[n + i, c] = 0.0
-                        for c in range(i, n):
-                            slow[i, c] = triangle[i, c]
-                        slow[i, 2 * n] = triangle[i, n]
-                    for i in range(link_counts[link]):
-                        for c in range(n):
-                            slow_rows[i, c] = M[link * M_step, i, c]
-                            slow_rows[i, n + c] = L[link * L_step, i, c]
-                        slow_rows[i, 2 * n] = u[link * u_step, i]
-                    link_nis[link], link_dof[link] = insert_rows_kernel(slow, slow_rows, link_counts[link])
-                    for i in range(n):
-                        for c in range(w):
-                            W[i, c] = slow[i, c]
-                        for c in range(i, n):
-                            triangle[i, c] = slow[n + i, n + c]
-                        triangle[i, n] = slow[n + i, 2 * n]
+                        norm2 += row[c] * row[c]
+                    if norm2 != 0.0:  # a row of zeros is absent
+                        row[2 * n] = u[link * u_step, r]
+                        weight = 1.0
+                        for j in range(2 * n):
+                            a = row[j]
+                            if a == 0.0:
+                                continue
+                            strength = weight * a
+                            d = D[j]
+                            if d != 0.0:
+                                grown = d + strength * a
+                                inverse = 1.0 / grown
+                                keep = d * inverse
+                                take = strength * inverse
+                                weight *= keep
+                                D[j] = grown
+                                for c in range(j + 1, w):
+                                    t = T[j, c]
+                                    T[j, c] = keep * t + take * row[c]
+                                    row[c] -= a * t
+                            elif not strength * a <= EMPTY * norm2:  # else: what rounding left of a zero
+                                D[j] = strength * a
+                                inverse = 1.0 / a
+                                for c in range(j + 1, w):
+                                    T[j, c] = row[c] * inverse
+                                weight = -1.0  # a necessary row
+                                break
+                        if weight >= 0.0:
+                            total += weight * row[2 * n] * row[2 * n]
+                            redundant += 1
+                link_nis[link] = total
+                link_dof[link] = redundant
                 if broken < 0:
                     tied = False
                     for i in range(n):
                         for c in range(n, 2 * n):
-                            if W[i, c] != 0.0:
+                            if D[i] != 0.0 and T[i, c] != 0.0:
                                 tied = True
                                 break
                         if tied:
@@ -259,62 +223,78 @@ def forward_kernel(size: int) -> Callable[..., int]:
                         broken = link
                 if store:
                     for i in range(n):
+                        r = np.sqrt(D[i])
                         for c in range(i):
                             records[link, i, c] = 0.0
-                        for c in range(i, w):
-                            records[link, i, c] = W[i, c]
-            # the rows [H | z] into [R | b], which stands in the right half of the work array
+                        records[link, i, i] = r
+                        for c in range(i + 1, w):
+                            records[link, i, c] = r * T[i, c]
             if gate:
                 for i in range(n):
-                    for c in range(i, n + 1):
-                        slow_triangle[i, c] = triangle[i, c]
-            full = True
-            for i in range(n):
-                full = full and triangle[i, i] > 0.0
-            if full:
-                for i in range(n):
-                    for c in range(i, n + 1):
-                        W[i, n + c] = triangle[i, c]
-                used = 0
-                for i in range(counts[k]):
-                    present = False
-                    for c in range(n):
-                        W[n + used, n + c] = H[k * H_step, i, c]
-                        present = present or H[k * H_step, i, c] != 0.0
-                    if present:
-                        W[n + used, 2 * n] = z[k, i]
-                        used += 1
-                for j in range(n):
-                    _reflect(W, j, n + j, n, n + used, w)
-                total = 0.0
-                for i in range(n, n + used):
-                    total += W[i, 2 * n] * W[i, 2 * n]
-                for i in range(n):
-                    for c in range(i, n + 1):
-                        triangle[i, c] = W[i, n + c]
-            else:
-                for i in range(counts[k]):
-                    for c in range(n):
-                        slow_observations[i, c] = H[k * H_step, i, c]
-                    slow_observations[i, n] = z[k, i]
-                total, used = insert_rows_kernel(triangle, slow_observations, counts[k])
+                    D_kept[i] = D[n + i]
+                    for c in range(i + 1, n + 1):
+                        T_kept[i, c] = T[n + i, n + c]
+            total = 0.0
+            redundant = 0
+            for r in range(counts[k]):
+                norm2 = 0.0
+                for c in range(n):
+                    row[n + c] = H[k * H_step, r, c]
+                    norm2 += row[n + c] * row[n + c]
+                if norm2 != 0.0:
+                    row[2 * n] = z[k, r]
+                    weight = 1.0
+                    for j in range(n, 2 * n):
+                        a = row[j]
+                        if a == 0.0:
+                            continue
+                        strength = weight * a
+                        d = D[j]
+                        if d != 0.0:
+                            grown = d + strength * a
+                            inverse = 1.0 / grown
+                            keep = d * inverse
+                            take = strength * inverse
+                            weight *= keep
+                            D[j] = grown
+                            for c in range(j + 1, w):
+                                t = T[j, c]
+                                T[j, c] = keep * t + take * row[c]
+                                row[c] -= a * t
+                        elif not strength * a <= EMPTY * norm2:  # else: what rounding left of a zero
+                            D[j] = strength * a
+                            inverse = 1.0 / a
+                            for c in range(j + 1, w):
+                                T[j, c] = row[c] * inverse
+                            weight = -1.0  # a necessary row
+                            break
+                    if weight >= 0.0:
+                        total += weight * row[2 * n] * row[2 * n]
+                        redundant += 1
             nis[k] = total
-            dof[k] = used
-            rejected[k] = gate and used > 0 and total > limits[used]
+            dof[k] = redundant
+            rejected[k] = gate and redundant > 0 and total > limits[redundant]
             if rejected[k]:
                 for i in range(n):
-                    for c in range(i, n + 1):
-                        triangle[i, c] = slow_triangle[i, c]
+                    D[n + i] = D_kept[i]
+                    for c in range(i + 1, n + 1):
+                        T[n + i, n + c] = T_kept[i, c]
             if estimate:
+                determined = True
                 for i in range(n - 1, -1, -1):
-                    t = triangle[i, n]
+                    determined = determined and D[n + i] != 0.0
+                    t = T[n + i, 2 * n]
                     for c in range(i + 1, n):
-                        t -= triangle[i, c] * filtered[k, c]
-                    filtered[k, i] = t / triangle[i, i] if triangle[i, i] > 0.0 else np.nan
-                for i in range(n):
-                    if not triangle[i, i] > 0.0:
-                        for c in range(n):
-                            filtered[k, c] = np.nan
+                        t -= T[n + i, n + c] * filtered[k, c]
+                    filtered[k, i] = t
+                if not determined:
+                    for i in range(n):
+                        filtered[k, i] = np.nan
+        for i in range(n):
+            r = np.sqrt(D[n + i])
+            triangle[i, i] = r
+            for c in range(i + 1, n + 1):
+                triangle[i, c] = r * T[n + i, n + c]
         return broken
 
     return cast("Callable[..., int]", forward)
@@ -464,7 +444,7 @@ def triangularize_rows(A: FloatArray, rows: int) -> int:
             below += A[i, j] * A[i, j]
         alpha = A[i, column] if column < k else 0.0
         tail = alpha * alpha + below
-        if tail <= PIVOT_TOLERANCE * PIVOT_TOLERANCE * (before + tail):
+        if tail <= EMPTY * (before + tail):
             for j in range(column, k):
                 A[i, j] = 0.0
             continue
