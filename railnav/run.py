@@ -35,7 +35,7 @@ class GnssStream:
     time : (m,) array
         Seconds since the run's start, strictly increasing.
     latitude, longitude : (m,) array
-        Geodetic coordinates of the antenna in `frame`, rad.
+        Geodetic WGS 84 coordinates of the antenna, rad.
     height : (m,) array or None
         Ellipsoidal height of the antenna, m.
     sigma_east, sigma_north, sigma_up : (m,) array or None
@@ -47,7 +47,7 @@ class GnssStream:
     lever_arm_b : (3,) array
         Reference point to antenna: forward, right, down, m.
     frame : str
-        The frame of the coordinates, as run.toml names it.
+        The frame that the coordinates came in, as run.toml names it; reading turned them to WGS 84.
     receiver : str
         Kind of receiver, where run.toml names it; otherwise empty.
     """

@@ -18,7 +18,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from railnav.errors import RunError
+from railnav.errors import CrsError, RunError
 from railnav.io.atomic import atomic_folder
 from railnav.io.tables import Column, Table, Words, freeze, read_table, write_table
 from railnav.run import BaliseStream, GaugeStream, GnssStream, GyroAnglesStream, ImuStream, OdometerStream, Run
@@ -129,8 +129,9 @@ def read_run(folder: str | Path) -> Run:
 
     Notes
     -----
-    GNSS coordinates stay in the frame that run.toml names; `GnssStream.frame` carries the name. An unsigned odometer that
-    falls by more than 0.1 m is refused.
+    GNSS coordinates in another frame than WGS 84 are turned to it by the one operation that `railnav.geodesy` pins for their
+    place; `GnssStream.frame` keeps the name of the frame they came in. An unsigned odometer that falls by more than 0.1 m is
+    refused.
 
     Examples
     --------
@@ -159,7 +160,7 @@ def read_run(folder: str | Path) -> Run:
         id=contents.run.id,
         start=start,
         direction=contents.run.direction,
-        gnss=_gnss(tables["gnss"], time["gnss"], contents.gnss) if contents.gnss else None,
+        gnss=_gnss(tables["gnss"], time["gnss"], contents.gnss, folder / CONTENTS) if contents.gnss else None,
         imu=_imu(tables["imu"], time["imu"], contents.imu) if contents.imu else None,
         odometer=_odometer(tables["odometer"], time["odometer"], contents.odometer) if contents.odometer else None,
         gyro_angles=_gyro_angles(tables["gyro_angles"], time["gyro_angles"]) if contents.gyro_angles else None,
@@ -317,7 +318,7 @@ def _contents_text(run: Run) -> str:
             continue
         lines += ["", f"[{name}]", f'file = "{name}.csv"', 'format = "csv"']
         if isinstance(stream, GnssStream):
-            lines.append(f"frame = {_quoted(stream.frame)}")
+            lines.append('frame = "WGS84"')  # whatever they came in, in memory they are WGS 84
             if stream.receiver:
                 lines.append(f"receiver = {_quoted(stream.receiver)}")
         if isinstance(stream, GnssStream | ImuStream):
@@ -354,12 +355,24 @@ def _fixed(values: Sequence[float]) -> FloatArray:
     return freeze(np.array(values, dtype=np.float64))
 
 
-def _gnss(table: Table, time: FloatArray, stream: _Gnss) -> GnssStream:
+def _gnss(table: Table, time: FloatArray, stream: _Gnss, toml: Path) -> GnssStream:
+    latitude, longitude = np.deg2rad(table.number["latitude_deg"]), np.deg2rad(table.number["longitude_deg"])
+    height = _known(table, "height_m")
+    if stream.frame != "WGS84":
+        from railnav.geodesy.transformation import geodetic_frame
+
+        try:
+            latitude, longitude, up = geodetic_frame(stream.frame, latitude, longitude).to_wgs84(
+                latitude, longitude, height
+            )
+        except CrsError as error:
+            raise RunError(str(error), file=toml, column="gnss.frame") from error
+        height = None if height is None else freeze(up)
     return GnssStream(
         time=time,
-        latitude=freeze(np.deg2rad(table.number["latitude_deg"])),
-        longitude=freeze(np.deg2rad(table.number["longitude_deg"])),
-        height=_known(table, "height_m"),
+        latitude=freeze(latitude),
+        longitude=freeze(longitude),
+        height=height,
         sigma_east=_known(table, "sigma_east_m"),
         sigma_north=_known(table, "sigma_north_m"),
         sigma_up=_known(table, "sigma_up_m"),

@@ -419,7 +419,7 @@ def _warnings(
         )
     frames = sorted({f.run.gnss.frame for f in survey.fixes if f.run.gnss is not None})
     if len(frames) > 1:
-        out.append(f"runs name different frames ({', '.join(frames)}); their positions are taken as they are")
+        out.append(f"runs came in different frames ({', '.join(frames)}), turned to WGS 84 as the registry has it")
     for t in tracks:
         if len(t.runs) == 1:
             out.append(

@@ -94,6 +94,24 @@ def test_all_streams_come_in_si_and_radians(folder):
         assert not array.flags.writeable
 
 
+def test_positions_in_another_frame_become_wgs84(folder):
+    """DB_REF (Bessel) lies some 100 m from WGS 84 in Germany; the operation is the registry's."""
+    from pyproj import Transformer
+
+    rows = "time_s,latitude_deg,longitude_deg,height_m\n0,50.0,9.0,150.0\n1,50.001,9.0,\n"
+    run = read_run(folder(gnss=rows, toml='frame = "EPSG:5830"\n'))
+    oracle = Transformer.from_crs("EPSG:5830", "EPSG:4979", allow_ballpark=False)
+    latitude, longitude, height = oracle.transform(50.0, 9.0, 150.0)
+    assert np.degrees(run.gnss.latitude[0]) == pytest.approx(latitude, abs=2e-8)
+    assert np.degrees(run.gnss.longitude[0]) == pytest.approx(longitude, abs=2e-8)
+    assert run.gnss.height[0] == pytest.approx(height, abs=2e-3)
+    assert np.isnan(run.gnss.height[1])
+    assert abs(np.degrees(run.gnss.latitude[0]) - 50.0) > 5e-4
+    assert run.gnss.frame == "EPSG:5830"
+    with pytest.raises(RunError, match=r"run\.toml, column gnss\.frame: .*MARS"):
+        read_run(folder(gnss=rows, toml='frame = "MARS"\n'))
+
+
 def test_settings_of_run_toml_are_kept(folder):
     toml = (
         'frame = "EPSG:7912"\nreceiver = "ublox"\nlever_arm_m = [1, 0.5, -3.1]\ntime_offset_s = -0.125\nunknown = 3\n'
@@ -507,7 +525,6 @@ def full_run(random):
             course=some,
             satellites=np.full(50, 7.0),
             lever_arm_b=np.array([1.2, -0.0, -3.1]),
-            frame="EPSG:7912",
             receiver="x",
         ),
         imu=ImuStream(
