@@ -6,6 +6,8 @@ Nothing heavy is imported here: a verb's module is loaded when the verb is asked
 from __future__ import annotations
 
 import importlib
+import sys
+from io import TextIOWrapper
 
 import click
 
@@ -63,6 +65,9 @@ class VerbGroup(click.Group):
         """Run a verb; bad data or a bad request is one line and exit code 1, never a traceback."""
         from railnav.errors import RailnavError
 
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, TextIOWrapper):
+                stream.reconfigure(errors="replace")  # a terminal without a sign shows "?", it does not stop the work
         try:
             return super().invoke(ctx)
         except BrokenPipeError:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,8 +44,8 @@ def command(output: Path, seed: int, as_json: bool) -> None:
     _files.check_output_folder(output, mark=REPORT)
     _files.need_report()
     begin = time.perf_counter()
-    with progress() as tell, _staging(output) as folder:
-        facts, lines = _demo(folder, output, seed, tell)
+    with progress() as tell, _staging(output) as folder, _second_core() as compiled:
+        facts, lines = _demo(folder, output, seed, tell, compiled)
     facts["wall_s"] = round(time.perf_counter() - begin, 1)
     if as_json:
         print_json(facts)
@@ -80,6 +80,53 @@ def _staging(output: Path) -> Iterator[Path]:
         shutil.rmtree(draft, ignore_errors=True)
 
 
+#: What the second process does: a minute's run, navigated and smoothed, so that numba compiles and stores the navigator's kernels.
+_COMPILE_NAVIGATOR = """
+from railnav.navigation import navigate
+from railnav.simulation import Leg, demo_line, simulate
+model = demo_line(spacing=20.0)
+run, _ = simulate(model, Leg(("77R-01",), start=50.0, finish=600.0), seed=1)
+navigate(run, model, smooth=True)
+"""
+
+
+@contextmanager
+def _second_core() -> Iterator[Callable[[Progress | None], None]]:
+    """Let a second process compile the navigator's kernels while this one simulates and builds; first time only.
+
+    Yields
+    ------
+    callable
+        Waits for that process; without need, it returns at once.
+    """
+    import subprocess
+    import sys
+
+    import railnav.navigation
+
+    stored = Path(railnav.navigation.__file__).with_name("__pycache__")
+    if not sys.executable or any(stored.glob("*.nbi")):
+        yield lambda _: None
+        return
+    command = [sys.executable, "-c", _COMPILE_NAVIGATOR]
+    quiet = subprocess.DEVNULL
+    process = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet)  # noqa: S603 - our own words
+
+    def wait(tell: Progress | None) -> None:
+        if tell:
+            tell("compile, first time only", 0, 1)
+        process.wait()
+        if tell:
+            tell("compile, first time only", 1, 1)
+
+    try:
+        yield wait
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+
+
 class _Watch:
     """Wall time of each step, s."""
 
@@ -93,7 +140,9 @@ class _Watch:
         self._last = now
 
 
-def _demo(folder: Path, shown: Path, seed: int, tell: Progress | None) -> tuple[dict[str, Any], list[str]]:
+def _demo(
+    folder: Path, shown: Path, seed: int, tell: Progress | None, compiled: Callable[[Progress | None], None]
+) -> tuple[dict[str, Any], list[str]]:
     """Go the whole way in a folder; returns facts for JSON, and lines for people."""
     from dataclasses import replace
 
@@ -121,6 +170,7 @@ def _demo(folder: Path, shown: Path, seed: int, tell: Progress | None) -> tuple[
     truth = _truth_on(model, simulated_truth)
     write_truth(truth, folder / "truth.csv")
     watch.done("write the model, and the truth on it")
+    compiled(tell)
     solution = navigate(service, model, progress=tell)
     watch.done("navigate, as if live")
     smoothed = navigate(service, model, smooth=True, progress=tell)

@@ -49,6 +49,7 @@ def solution_page(solution: Solution, model: TrackModel | None = None) -> str:
     return page(
         f"Solution {solution.run_id}".strip(),
         subtitle=_when(solution),
+        badge=SIMULATED if model is not None and is_simulated(model) else "",
         lead=[solution_words(solution)],
         cards=_solution_cards(solution),
         sections=[
@@ -89,7 +90,7 @@ def evaluation_page(solution: Solution, truth: Truth, evaluation: Evaluation, mo
     return page(
         f"Solution {solution.run_id} against the truth".replace("  ", " "),
         subtitle=_when(solution),
-        badge=SIMULATED if truth.simulated else "",
+        badge=SIMULATED if truth.simulated or (model is not None and is_simulated(model)) else "",
         lead=evaluation_words(evaluation),
         cards=evaluation_cards(evaluation),
         sections=_evaluation_sections(solution, truth, evaluation, model),
@@ -135,10 +136,14 @@ def build_page(model: TrackModel) -> str:
     if isinstance(build, Mapping):
         lead.append(build_words(build))
         sections += build_sections(build)
-    simulated = bool(model.provenance.get("simulated"))
-    return page(
-        "Reference track model", badge=SIMULATED if simulated else "", lead=lead, cards=cards, sections=sections
-    )
+    badge = SIMULATED if is_simulated(model) else ""
+    return page("Reference track model", badge=badge, lead=lead, cards=cards, sections=sections)
+
+
+def is_simulated(model: TrackModel) -> bool:
+    """Whether a model says of itself that it is fictitious, or built from simulated runs."""
+    source = str(model.provenance.get("source", ""))
+    return bool(model.provenance.get("simulated")) or source.startswith("railnav.simulation")
 
 
 def build_words(build: Mapping[str, Any]) -> str:

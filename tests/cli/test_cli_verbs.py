@@ -271,6 +271,53 @@ def test_a_demo_that_fails_leaves_the_older_one(tmp_path: Path, monkeypatch: pyt
     assert (older / "report.html").read_text() == "newer"
 
 
+def test_the_second_core_is_given_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The process that compiles meanwhile ends with the demo, however that ends; without need there is none."""
+    import time
+
+    import railnav.navigation
+    from railnav.cli import demo
+
+    monkeypatch.setattr(railnav.navigation, "__file__", str(tmp_path / "__init__.py"))
+    monkeypatch.setattr(demo, "_COMPILE_NAVIGATOR", "import time; time.sleep(60)")
+    begin = time.perf_counter()
+    with pytest.raises(KeyboardInterrupt), demo._second_core():
+        raise KeyboardInterrupt
+    assert time.perf_counter() - begin < 30.0
+    monkeypatch.setattr(demo, "_COMPILE_NAVIGATOR", "raise SystemExit(3)")
+    stages: list[tuple[str, int, int]] = []
+    with demo._second_core() as compiled:
+        compiled(lambda *stage: stages.append(stage))
+    assert stages[-1] == ("compile, first time only", 1, 1)
+    (tmp_path / "__pycache__").mkdir()
+    (tmp_path / "__pycache__" / "kernels.nbi").touch()
+    with demo._second_core() as compiled:
+        compiled(lambda *stage: stages.append(stage))
+    assert len(stages) == 2
+
+
+@pytest.mark.slow
+def test_an_interrupted_demo_leaves_nothing(tmp_path: Path) -> None:
+    import signal
+    import subprocess
+    import sys
+    import time
+
+    process = subprocess.Popen(
+        [sys.executable, "-m", "railnav", "demo", "-o", str(tmp_path / "demo")],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    time.sleep(2.5)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, out) == (130, "")
+    assert "interrupted" in err
+    assert "Traceback" not in err
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.slow
 def test_the_demo_and_every_example_of_the_help(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """House rule: run what you print. The examples of every verb run on what the demo leaves behind."""
