@@ -1,5 +1,4 @@
-"""Inertial sensors and what can be made of them alone: error models, noise analysis, calibration, strapdown
-mechanization.
+"""Inertial sensors and what can be made of them alone: error models, calibration, alignment, strapdown.
 
 Body axes b are forward, right, down; local axes n are north, east, down. `specific_force_b` is what an accelerometer measures,
 acceleration minus gravitation: at rest it points up with the size of gravity, so its third component is about -9.81 m/s^2 on a

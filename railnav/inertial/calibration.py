@@ -363,10 +363,12 @@ def multi_position(
         raise EstimationError(_too_few(V, 9 - len(V), f"{len(V)} positions cannot determine 9 parameters"))
     v, r = V / unit, g / unit
     free = _FREE[form]
+    M: FloatArray
+    b: FloatArray
     M, b = _ellipsoid(v, r) or (np.eye(3), np.zeros(3))
     if form == "lower":  # the lower triangular M with the same M^T M
         M = np.asarray(np.linalg.cholesky((M.T @ M)[::-1, ::-1]).T[::-1, ::-1], dtype=np.float64)
-        M = M * np.sign(np.diagonal(M))[:, None]
+        M = np.asarray(M * np.sign(np.diagonal(M))[:, None])
     # rank is judged at the design itself, so that a bad start cannot hide it
     _refuse_rank(V, _norm_rows(v - b, np.linalg.norm(v - b, axis=1)))
     converged = False
@@ -374,7 +376,8 @@ def multi_position(
     damping = 1e-6
     for _ in range(100):
         normal = J.T @ J
-        step = np.linalg.solve(normal + damping * np.diag(np.diagonal(normal)), -J.T @ misfit)
+        damped = normal + damping * np.diag(np.diagonal(normal))
+        step = np.asarray(np.linalg.solve(damped, -J.T @ misfit), dtype=np.float64)
         trial_M, trial_b = _moved(M, b, step, free)
         trial, trial_J = _misfit(trial_M, trial_b, v, r, free)
         if trial @ trial <= misfit @ misfit:
