@@ -32,7 +32,7 @@ def command(
 ) -> None:
     """Turn a track network (GeoJSON or elements CSV) into a reference track model.
 
-    GeoJSON (.geojson, .json): one LineString a track, in WGS 84, property `track`. Elements (.csv): straights, arcs
+    GeoJSON (.geojson, .json): one LineString a track, in WGS 84, property `track`. Elements (.csv, .parquet): straights, arcs
     and clothoids with the coordinates of their start; --crs names their plane.
 
     \b
@@ -54,17 +54,19 @@ def command(
         from railnav.io.geojson import read_geojson
 
         model = read_geojson(source, **request, spacing=spacing)
-    elif ending == ".csv":
+    elif ending in (".csv", ".parquet"):
         from railnav.io.elements import read_elements
 
-        if crs is None:
+        if request["crs"] is None:
             raise InputError(
                 "elements need the plane of their coordinates", file=source, remedy="name it, e.g. --crs EPSG:31467"
             )
-        model = read_elements(source, crs=crs, spacing=spacing)
+        model = read_elements(source, crs=request["crs"], spacing=spacing)
     else:
         raise InputError(
-            "a network of this ending cannot be imported", file=source, remedy="use .geojson, .json or elements .csv"
+            "a network of this ending cannot be imported",
+            file=source,
+            remedy="use .geojson, .json or elements .csv or .parquet",
         )
     model.to_file(output)
     facts = describe_model(model)

@@ -124,6 +124,26 @@ def test_import_into_another_plane(here: Path) -> None:
     assert abs(facts["length_m"] - 57276.0) < 2.0, "true ground length does not depend on the plane"
 
 
+def test_import_elements(here: Path) -> None:
+    """A straight of 100 m, then a quarter circle to the right of 400 m radius; lengths in the plane, as the table has them."""
+    quarter = 400.0 * np.pi / 2
+    (here / "elements.csv").write_text(
+        "track,sequence,start_m,length_m,element,radius_start_m,radius_end_m,easting_m,northing_m,grid_bearing_deg\n"
+        "1,1,0,100,straight,,,3460000,5480000,90\n"
+        f"1,2,100,{quarter},arc,400,400,3460100,5480000,90\n"
+    )
+    facts = run_json("import", "elements.csv", "-o", "elements.gpkg", "--crs", "31467")
+    assert facts["length_m"] == pytest.approx(100.0 + quarter, rel=1e-4)
+    assert facts["tracks"][0]["tightest_radius_m"] == pytest.approx(400.0, rel=1e-3)
+    model = read_model(here / "elements.gpkg")
+    assert model.easting[-1] == pytest.approx(3460500.0, abs=0.01)
+    assert model.northing[-1] == pytest.approx(5479600.0, abs=0.01)
+    for plane in ([], ["--crs", "gk3"]):
+        done = CliRunner().invoke(main, ["import", "elements.csv", "-o", "other.gpkg", *plane])
+        assert (done.exit_code, len(done.stderr.splitlines())) == (1, 1)
+        assert "--crs EPSG" in done.stderr
+
+
 @pytest.mark.parametrize("ending", ["parquet", "gpkg", "geojson", "csv"])
 def test_convert_a_solution(here: Path, ending: str) -> None:
     facts = run_json("convert", "solution.csv", "-o", f"out.{ending}")
@@ -236,11 +256,27 @@ def test_a_truth_moves_to_a_model_built_anew() -> None:
     assert moved.simulated
     np.testing.assert_allclose(moved.offset, truth.offset, atol=2e-3)
     np.testing.assert_array_equal(moved.time, truth.time)
-    found = _axis_error(model, model)
-    assert found["axis_rms_m"] == pytest.approx(0.0, abs=1e-6)
-    assert found["axis_tunnel_max_m"] == pytest.approx(0.0, abs=1e-6)
     with pytest.raises(OffModelError):
         _truth_on(renamed, replace(truth, latitude=truth.latitude + 0.01))
+
+
+def test_the_axis_of_a_model_beside_the_true_one(here: Path) -> None:
+    from railnav.cli.demo import _axis_error
+    from railnav.io.geojson import read_geojson
+
+    network = json.loads((here / "line.geojson").read_text(encoding="utf-8"))
+    network["features"] = [f for f in network["features"] if f["properties"]["track"] in ("77R-03", "77L-10")]
+    (here / "two.geojson").write_text(json.dumps(network))
+    found = _axis_error(read_geojson(here / "two.geojson"), demo_line(spacing=5.0))
+    assert found["axis_rms_m"] == pytest.approx(0.0, abs=1e-3)
+    assert found["axis_tunnel_max_m"] == pytest.approx(0.0, abs=1e-3)
+    for feature in network["features"]:
+        for vertex in feature["geometry"]["coordinates"]:
+            vertex[1] += 0.5 / 111_250.0
+    (here / "two.geojson").write_text(json.dumps(network))
+    found = _axis_error(read_geojson(here / "two.geojson"), demo_line(spacing=5.0))
+    assert found["axis_rms_m"] is not None
+    assert 0.3 < found["axis_rms_m"] < 0.5, "half a metre north, seen across a line that runs north-east"
 
 
 def test_a_demo_that_fails_leaves_the_older_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
