@@ -245,7 +245,7 @@ def test_a_truth_moves_to_a_model_built_anew() -> None:
     """On the very model it was simulated on, under another name, the truth is what it was."""
     from dataclasses import replace
 
-    from railnav.cli.demo import _axis_error, _truth_on
+    from railnav.cli.demo import _truth_on
     from railnav.errors import OffModelError
 
     model = demo_line(spacing=5.0)
