@@ -56,7 +56,7 @@ class Fixes:
     reason : (m,) int array
         Index into `REASONS`.
     size : (m,) array
-        How large the matter is: sigma, m; speed, m/s; or distance, m.
+        How large the matter is: the stated sigma, the jump, or the distance, m.
     forward : float
         Reference point to antenna along the vehicle, m; 0 where the attitude is known and the antenna already brought down.
     right : (m,) array
@@ -118,10 +118,10 @@ def gather(run: Run, frame: GridFrame) -> Fixes:
     if len(good) >= 3:
         step = np.hypot(np.diff(east[good]), np.diff(north[good]))
         slack = 20.0 if not stated.any() else 3.0 * float(np.median(sigma[stated]))
-        speed = np.maximum(step - slack, 0.0) / np.diff(gnss.time[good])
-        before, after = np.append(0.0, speed), np.append(speed, 0.0)
-        wild = (before > TOP_SPEED) & (after > TOP_SPEED)
-        reason[good[wild]], size[good[wild]] = JUMP, np.minimum(before, after)[wild]
+        fast = np.maximum(step - slack, 0.0) > TOP_SPEED * np.diff(gnss.time[good])
+        wild = np.append(False, fast) & np.append(fast, False)
+        jump = np.minimum(np.append(0.0, step), np.append(step, 0.0))
+        reason[good[wild]], size[good[wild]] = JUMP, jump[wild]
     kept = int(np.count_nonzero(reason == USED))
     if kept < FEWEST_FIXES:
         raise RunError(

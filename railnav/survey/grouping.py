@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from railnav.survey.offsets import HOLD, robust_fit
+
 FloatArray = NDArray[np.float64]
 
 #: Pairs whose differences scatter less than this see single tracks, m.
@@ -26,16 +28,7 @@ def parallel_distance(D: FloatArray, design: FloatArray) -> tuple[float, float, 
     if many < 5:
         return float("nan"), float("nan"), many
     A = np.column_stack([np.ones(many), design[use]])
-    d = D[use]
-    x = np.array([float(np.median(d)), 0.0, 0.0])
-    prior = np.diag([0.0, 1.0, 1.0])
-    spread = 1.0
-    for _ in range(8):
-        e = d - A @ x
-        spread = max(1.4826 * float(np.median(np.abs(e))), 1e-3)
-        take = np.abs(e) <= 3.0 * spread
-        weight = 1.0 / (50.0 * spread**2)  # some 50 nodes err together
-        x = np.linalg.solve(weight * A[take].T @ A[take] + prior + 1e-9 * np.eye(3), weight * A[take].T @ d[take])
+    x, spread = robust_fit(A, D[use], np.array([0.0, HOLD, HOLD]))
     return float(x[0]), spread, many
 
 

@@ -22,6 +22,8 @@ FloatArray = NDArray[np.float64]
 MEMORIES = (3.0, 4.5, 7.0, 10.0, 15.0, 22.0, 33.0, 50.0, 75.0, 110.0, 170.0, 250.0)
 #: Errors that decay faster than this are white to the track, s.
 SHORT = 12.0
+#: A longer correlation time is as good when it leaves no more than this times the least misfit.
+NEARLY = 1.15
 #: A second correlation time is taken when it leaves less than this of the misfit.
 CLEARLY = 0.5
 #: How much better or worse than its receiver's usual a single run may be.
@@ -200,7 +202,11 @@ def _fit(A: FloatArray, y: FloatArray, count: float, rate: float) -> ErrorModel:
         return float(norm) ** 2, part
 
     many = len(memory) + 1
-    cost, part = min((fit(j) for j in range(1, many)), key=lambda item: item[0])
+    singles = [fit(j) for j in range(1, many)]
+    best = min(range(len(singles)), key=lambda j: singles[j][0])
+    cost, part = singles[best]
+    if best + 1 < len(singles) and singles[best + 1][0] <= NEARLY * cost:
+        part = singles[best + 1][1]  # the next longer memory fits nearly as well, and averages less
     pairs = [fit(i, j) for i in range(1, many) for j in range(i + 2, many)]
     cost_2, part_2 = min(pairs, key=lambda item: item[0])
     if cost_2 < CLEARLY * cost:

@@ -88,7 +88,7 @@ class Nominal:
 
 
 def curve(easting: FloatArray, northing: FloatArray, step: float) -> Nominal:
-    """Lay a C2 curve through points in order and tabulate it every `step` metres of its own length."""
+    """Lay a C2 curve through points in order and tabulate it about every `step` metres of its own length, end to end."""
     from scipy.interpolate import CubicSpline
 
     chord = np.hypot(np.diff(easting), np.diff(northing))
@@ -101,8 +101,9 @@ def curve(easting: FloatArray, northing: FloatArray, step: float) -> Nominal:
     rate = np.hypot(*first(fine).T)
     middle = np.hypot(*first(0.5 * (fine[1:] + fine[:-1])).T)
     s = np.append(0.0, np.cumsum(np.diff(fine) * (rate[1:] + rate[:-1] + 4.0 * middle) / 6.0))
-    count = max(2, int(s[-1] / step) + 1)
-    at = np.interp(np.arange(count) * step, s, fine)
+    count = max(3, round(float(s[-1]) / step) + 1)
+    step = float(s[-1]) / (count - 1)
+    at = np.interp(np.linspace(0.0, s[-1], count), s, fine)
     d1, d2 = first(at), spline.derivative(2)(at)
     size = np.hypot(d1[:, 0], d1[:, 1])
     xy = spline(at)
@@ -121,6 +122,8 @@ def course(fixes: Fixes) -> FloatArray:
     used = fixes.reason == USED
     x, y = fixes.easting[used], fixes.northing[used]
     keep = _kernels.thin(x, y, THINNING)
+    if len(x) and np.hypot(x[-1] - x[keep][-1], y[-1] - y[keep][-1]) > 0.2 * THINNING:
+        keep[-1] = True
     points = np.column_stack([x[keep], y[keep]])
     for _ in range(5):
         if len(points) < 3:

@@ -20,6 +20,8 @@ IntArray = NDArray[np.int64]
 MAJORITY = 2.0
 #: Prior of a receiver's own offset, m: none to speak of.
 RECEIVER_PRIOR = 1e3
+#: Draws an offset that a straight line does not show to nothing.
+HOLD = 1e-3
 #: Weight of the datum's condition, 1/m.
 GAUGE = 1e4
 #: Degrees of freedom of the prior on how far runs of one receiver scatter.
@@ -173,20 +175,7 @@ def differences(value: FloatArray, design: FloatArray, runs: Sequence[int]) -> K
             use = np.isfinite(D)
             if np.count_nonzero(use) < 10:
                 continue
-            x = np.zeros(B)
-            x[:] = 0.0
-            limit = np.inf
-            spread = 1.0
-            for _ in range(8):
-                take = use & (np.abs(D - design @ x) <= limit)
-                if np.count_nonzero(take) < 10:
-                    break
-                A = design[take]
-                # a straight line shows one component only: hold the other at nothing
-                x = np.linalg.solve(A.T @ A + 1e-3 * len(A) * np.eye(B), A.T @ D[take])
-                e = D[use] - design[use] @ x
-                spread = max(1.4826 * float(np.median(np.abs(e))), 1e-3)
-                limit = 3.0 * spread
+            x, spread = robust_fit(design[use], D[use], np.full(B, HOLD))
             A = design[use]
             information = A.T @ A / (50.0 * spread**2)  # some 50 nodes err together
             L = np.linalg.cholesky(information + 1e-9 * np.eye(B)).T
@@ -198,3 +187,28 @@ def differences(value: FloatArray, design: FloatArray, runs: Sequence[int]) -> K
     if not rows:
         return Knowledge(tuple(runs), np.zeros((1, K * B)), np.zeros(1))
     return Knowledge(tuple(runs), np.concatenate(rows), np.concatenate(values))
+
+
+def robust_fit(A: FloatArray, d: FloatArray, hold: FloatArray) -> tuple[FloatArray, float]:
+    """Robust regression d = A x: trimmed least squares from two starts, the one with the smaller scatter; and that scatter, m.
+
+    One start is nothing but the first column's median where it is constant (a stretch on another track is then what stands out),
+    the other least squares. `hold` (B,) draws each coefficient to nothing, lightly: a straight line does not show them all.
+    """
+    B = A.shape[1]
+    ridge = np.diag(hold)
+    plain = np.zeros(B)
+    if np.ptp(A[:, 0]) == 0.0 and hold[0] == 0.0:
+        plain[0] = float(np.median(d)) / A[0, 0]
+    best: FloatArray = plain
+    best_spread = np.inf
+    for start in (plain, np.linalg.solve(A.T @ A + len(A) * ridge, A.T @ d)):
+        x: FloatArray = start
+        for _ in range(8):
+            e = np.abs(d - A @ x)
+            take = e <= 3.0 * max(1.4826 * float(np.median(e)), 1e-3)
+            x = np.linalg.solve(A[take].T @ A[take] + take.sum() * ridge, A[take].T @ d[take])
+        spread = max(1.4826 * float(np.median(np.abs(d - A @ x))), 1e-3)
+        if spread < best_spread:
+            best, best_spread = x, spread
+    return best, best_spread

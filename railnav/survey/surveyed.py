@@ -197,7 +197,7 @@ def reduced(track: Surveyed, offset: FloatArray, step: float, receivers: list[st
 def relaid(track: Surveyed, fixes: Sequence[Fixes], *, step: float | None = None) -> Surveyed:
     """Make the estimated axis the nominal curve and lay the runs anew."""
     nominal = track.nominal.shifted(track.axis)
-    if step is not None and step != nominal.step:
+    if step is not None:
         nominal = nominal.resampled(step)
     new = lay(track.name, track.runs, fixes, nominal)
     new.errors, new.noise_level = track.errors, track.noise_level
