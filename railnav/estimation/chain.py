@@ -336,7 +336,7 @@ def solve_chain(
             "solve the two parts as chains of their own, or allow_breaks=True"
         )
     state = np.empty((N, n))
-    empty = _kernels.smooth_chain_kernel(sweep.records, triangle, state)
+    empty = _kernels.smooth_chain_kernel(compiled_size(n))(sweep.records, triangle, state)
     if (
         empty >= 0
         or not np.isfinite(state[0]).all()
@@ -349,7 +349,7 @@ def solve_chain(
     P = C = None
     if covariance:
         P, C = np.empty((N, n, n)), np.empty((N - 1, n, n))
-        _kernels.covariance_chain_kernel(sweep.records, triangle, P, C)
+        _kernels.covariance_chain_kernel(compiled_size(n))(sweep.records, triangle, P, C)
     return ChainSolution(
         state=state,
         covariance=P,
@@ -393,7 +393,7 @@ def sweep_chain(chain: Chain, triangle: FloatArray, *, store: bool, filtered: bo
         filtered=np.empty((N if filtered else 0, n)),
         broken=-1,
     )
-    forward = _kernels.forward_kernel(n if n in SPECIALISED_SIZES else 0)
+    forward = _kernels.forward_kernel(compiled_size(n))
     out.broken = forward(
         chain.H, chain.z, chain.counts, chain.M, chain.L, chain.u, chain.coupling_counts, chain.lead, triangle, limits,
         out.records, out.nis, out.dof, out.rejected, out.coupling_nis, out.coupling_dof, out.filtered,
@@ -410,6 +410,11 @@ def _undetermined(chain: Chain, epoch: int, component: int) -> str:
         f"epoch {epoch}: component {component} of the state is not determined by the rows ({seen}); "
         "add observations, couplings or a prior"
     )
+
+
+def compiled_size(n: int) -> int:
+    """Size to compile loops for, 0 for loops of any length; inside this room only."""
+    return n if n in SPECIALISED_SIZES else 0
 
 
 def start_triangle(prior: tuple[ArrayLike, ArrayLike] | None, n: int) -> FloatArray:

@@ -170,15 +170,14 @@ def constant_velocity_chain(
         H = np.concatenate([np.where(alone[:, :, None], HV, H), HV], axis=1)
         z = np.concatenate([np.where(alone, zV, z), zV], axis=1)
         counts = counts + with_velocity
-    # inverse Cholesky root of S [[h^3/3, h^2/2], [h^2/2, h]], written out
+    # inverse upper Cholesky root of S [[h^3/3, h^2/2], [h^2/2, h]], written out: [[a, b], [0, c]]
     L = np.zeros((N - 1, 2 * d, 2 * d))
     M = np.zeros_like(L)
-    a = np.sqrt(3.0 / (S * h[:, None] ** 3))
-    b, c = -3.0 / np.sqrt(S * h[:, None] ** 3), 2.0 / np.sqrt(S * h[:, None])
+    a = np.sqrt(12.0 / (S * h[:, None] ** 3))
+    b, c = -0.5 * a * h[:, None], 1.0 / np.sqrt(S * h[:, None])
     i = np.arange(d)
-    L[:, i, i], L[:, d + i, i], L[:, d + i, d + i] = a, b, c
-    M[:, i, i], M[:, i, d + i] = -a, -a * h[:, None]
-    M[:, d + i, i], M[:, d + i, d + i] = -b, -b * h[:, None] - c
+    L[:, i, i], L[:, i, d + i], L[:, d + i, d + i] = a, b, c
+    M[:, i, i], M[:, i, d + i], M[:, d + i, d + i] = -a, -a * h[:, None] - b, -c
     # nominal states that do not follow the dynamics leave W (F x0_k - x0_(k+1)), small before it is whitened
     step = np.concatenate([x0[:-1, :d] + h[:, None] * x0[:-1, d:], x0[:-1, d:]], axis=1) - x0[1:]
     return Chain(H, z, M, L, _apply(L, step), counts=counts, prior=prior)

@@ -159,24 +159,33 @@ def banded_solution(chain: Chain) -> FloatArray:
     if not (chain.coupling_counts == u.shape[1]).all():
         used = np.arange(u.shape[1]) < chain.coupling_counts[:, None]
         M, L, u = np.where(used[:, :, None], M, 0.0), np.where(used[:, :, None], L, 0.0), np.where(used, u, 0.0)
-    Ht, Mt, Lt = (np.swapaxes(a, 1, 2) for a in (H, M, L))
-    D = np.empty((N, n, n))
-    D[:] = Ht @ H
-    right = (Ht @ z[:, :, None])[:, :, 0]
-    D[:-1] += Mt @ M
-    D[1:] += Lt @ L
-    off = np.broadcast_to(Mt @ L, (N - 1, n, n))
-    right[:-1] += (Mt @ u[:, :, None])[:, :, 0]
-    right[1:] += (Lt @ u[:, :, None])[:, :, 0]
-    if chain.prior is not None:
-        D[0] += chain.prior[0].T @ chain.prior[0]
-        right[0] += chain.prior[0].T @ chain.prior[1]
+    # component by component on contiguous columns: twice as fast as products of small matrices
+    H, M, L = (np.ascontiguousarray(a.transpose(1, 2, 0)) for a in (H, M, L))
+    z, u = np.ascontiguousarray(z.T), np.ascontiguousarray(u.T)
+
+    def product(A: FloatArray, B: FloatArray) -> FloatArray:
+        return np.asarray(sum(a * b for a, b in zip(A, B, strict=True)), np.float64)
+
     band = np.zeros((2 * n, N * n))  # upper form: band[2n - 1 + i - j, j] = A[i, j]
+    right = np.empty((N, n))
     for i in range(n):
         for j in range(i, n):
-            band[2 * n - 1 + i - j, j::n] = D[:, i, j]
+            entry = np.zeros(N) + product(H[:, i], H[:, j])
+            entry[:-1] += product(M[:, i], M[:, j])
+            entry[1:] += product(L[:, i], L[:, j])
+            band[2 * n - 1 + i - j, j::n] = entry
         for j in range(n):
-            band[n - 1 + i - j, n + j :: n] = off[:, i, j]
+            band[n - 1 + i - j, n + j :: n] = product(M[:, i], L[:, j])
+        entry = np.zeros(N) + product(H[:, i], z)
+        entry[:-1] += product(M[:, i], u)
+        entry[1:] += product(L[:, i], u)
+        right[:, i] = entry
+    if chain.prior is not None:
+        R0, b0 = chain.prior
+        for i in range(n):
+            for j in range(i, n):
+                band[2 * n - 1 + i - j, j] += R0[:, i] @ R0[:, j]
+            right[0, i] += R0[:, i] @ b0
     solved = solveh_banded(band, right.ravel(), overwrite_ab=True, overwrite_b=True, check_finite=False)
     return np.asarray(solved).reshape(N, n)
 

@@ -152,7 +152,7 @@ def repair_covariance(covariance: ArrayLike) -> RepairedCovariance:
 def inverse_root(covariance: ArrayLike, *, method: Literal["cholesky", "symmetric"] = "cholesky") -> FloatArray:
     """Whiten: a matrix W with W^T W = K^-1 for each covariance K, so that W v has unit covariance.
 
-    ``cholesky`` gives W = L^-1 with K = L L^T, lower triangular, the fast default; ``symmetric`` gives
+    ``cholesky`` gives W = U^-1 with K = U U^T, upper triangular, the fast default; ``symmetric`` gives
     K^(-1/2) = V diag(lambda)^(-1/2) V^T by eigenvectors, the source's form. Estimates, covariances and the sum of squares of
     a block do not depend on the choice; single residuals do.
 
@@ -173,9 +173,13 @@ def inverse_root(covariance: ArrayLike, *, method: Literal["cholesky", "symmetri
     EstimationError
         A covariance is not positive definite (`repair_covariance` mends rounding), or a sigma is zero.
 
+    Notes
+    -----
+    Upper and not lower, because a chain keeps its triangles upper: the zeros then survive its rotations, and are skipped.
+
     References
     ----------
-    Specification rail, equations (19)-(21).
+    Specification rail, equations (19)-(21); its default is the lower factor.
 
     Examples
     --------
