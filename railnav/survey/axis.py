@@ -8,7 +8,7 @@ corrections, and a new nominal curve changes nothing. Frame offsets are border p
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +65,8 @@ class Chain:
         Second derivative of the nominal curve (curvature of an axis, 0 for heights).
     noise : (N-1,) array
         Standard deviation of the second derivative's random walk, per sqrt(m).
+    first_bend : float
+        Prior of the first node's whole second derivative.
     """
 
     step: float
@@ -77,6 +79,20 @@ class Chain:
     bend: FloatArray
     noise: FloatArray
     first_bend: float = FIRST_NODE[2]
+
+    def part(self, first: int, last: int) -> Chain:
+        """Nodes first..last-1 as a chain of their own."""
+        k = slice(first, last)
+        return replace(
+            self,
+            value=self.value[:, k],
+            lead=self.lead[:, k],
+            variance=self.variance[:, k],
+            time=self.time[:, k],
+            design=self.design[:, k],
+            bend=self.bend[k],
+            noise=self.noise[first : last - 1],
+        )
 
 
 @dataclass(slots=True, eq=False)

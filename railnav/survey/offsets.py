@@ -200,14 +200,14 @@ def robust_fit(A: FloatArray, d: FloatArray, hold: FloatArray) -> tuple[FloatArr
     plain = np.zeros(B)
     if np.ptp(A[:, 0]) == 0.0 and hold[0] == 0.0:
         plain[0] = float(np.median(d)) / A[0, 0]
-    best: FloatArray = plain
+    best: FloatArray = np.asarray(plain)
     best_spread = np.inf
     for start in (plain, np.linalg.solve(A.T @ A + len(A) * ridge, A.T @ d)):
-        x: FloatArray = start
+        x: FloatArray = np.asarray(start)
         for _ in range(8):
             e = np.abs(d - A @ x)
             take = e <= 3.0 * max(1.4826 * float(np.median(e)), 1e-3)
-            x = np.linalg.solve(A[take].T @ A[take] + take.sum() * ridge, A[take].T @ d[take])
+            x = np.asarray(np.linalg.solve(A[take].T @ A[take] + take.sum() * ridge, A[take].T @ d[take]))
         spread = max(1.4826 * float(np.median(np.abs(d - A @ x))), 1e-3)
         if spread < best_spread:
             best, best_spread = x, spread

@@ -35,6 +35,8 @@ OTHER_LENGTH, OTHER_SIZE = 100.0, 1.5
 TRACKS_APART = 1.5
 #: Curvature noise that is tried, 1/m per sqrt(m); the steepest clothoid, 1/(300 m * 50 m) over its 50 m, needs 5e-4.
 NOISES = (1e-6, 3e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3)
+#: It is chosen on so many windows of so many nodes at most.
+WINDOWS, WINDOW_NODES = 6, 400
 #: Degrees of freedom and reach, m, with which the curvature noise follows the track.
 LOCAL_DOF, LOCAL_REACH = 2.0, 30.0
 
@@ -293,8 +295,9 @@ def white_variances(P: Profiles, residual: FloatArray, errors: list[ErrorModel],
 
 
 def choose_noise(chain: Chain) -> float:
-    """The curvature noise of a whole track that makes its data most likely."""
-    score = [log_evidence(replace(chain, noise=np.full(len(chain.bend) - 1, level))) for level in NOISES]
+    """Choose the curvature noise of a whole track that makes its data most likely, on up to `WINDOWS` windows of it."""
+    windows = [chain.part(a, b) for a, b in _windows(len(chain.bend))]
+    score = [sum(log_evidence(replace(w, noise=np.full(len(w.bend) - 1, level))) for w in windows) for level in NOISES]
     best = int(np.argmax(score))
     if 0 < best < len(score) - 1:  # the top of the parabola through three points
         a, b, c = score[best - 1 : best + 2]
@@ -302,6 +305,14 @@ def choose_noise(chain: Chain) -> float:
         low, high = np.log(NOISES[best - 1]), np.log(NOISES[best + 1])
         return float(np.exp(np.log(NOISES[best]) + np.clip(shift, -0.5, 0.5) * 0.5 * (high - low)))
     return NOISES[best]
+
+
+def _windows(nodes: int) -> list[tuple[int, int]]:
+    """Spread windows of nodes (from, to) evenly over a track; all of it when it is short."""
+    if nodes <= WINDOWS * WINDOW_NODES:
+        return [(0, nodes)]
+    starts = np.linspace(0, nodes - WINDOW_NODES, WINDOWS).astype(int)
+    return [(int(a), int(a) + WINDOW_NODES) for a in starts]
 
 
 def local_noise(estimate: Estimate, level: float, step: float) -> FloatArray:

@@ -35,7 +35,7 @@ def single_line(seed, *, km=4.0, passes=PASSES, receivers=(SURVEY,), direction="
             axis,
             frame,
             rng,
-            id=f"run-{p + 1}",
+            run_id=f"run-{p + 1}",
             direction=direction,
             receiver=receivers[p % len(receivers)],
             day=p,
