@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -104,8 +105,11 @@ def _second_core() -> Iterator[Callable[[Progress | None], None]]:
 
     import railnav.navigation
 
-    stored = Path(railnav.navigation.__file__).with_name("__pycache__")
-    if not sys.executable or any(stored.glob("*.nbi")):
+    room = Path(railnav.navigation.__file__).parent
+    stored = [*room.glob("__pycache__/*.nbi")]  # where numba keeps what it compiled, unless it is told another place
+    if elsewhere := os.environ.get("NUMBA_CACHE_DIR"):
+        stored = [*Path(elsewhere).glob(f"{room.name}_*/*.nbi")]
+    if not sys.executable or stored:
         yield lambda _: None
         return
     command = [sys.executable, "-c", _COMPILE_NAVIGATOR]

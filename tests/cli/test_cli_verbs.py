@@ -314,6 +314,7 @@ def test_the_second_core_is_given_back(tmp_path: Path, monkeypatch: pytest.Monke
     import railnav.navigation
     from railnav.cli import demo
 
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     monkeypatch.setattr(railnav.navigation, "__file__", str(tmp_path / "__init__.py"))
     monkeypatch.setattr(demo, "_COMPILE_NAVIGATOR", "import time; time.sleep(60)")
     begin = time.perf_counter()
@@ -330,6 +331,16 @@ def test_the_second_core_is_given_back(tmp_path: Path, monkeypatch: pytest.Monke
     with demo._second_core() as compiled:
         compiled(lambda *stage: stages.append(stage))
     assert len(stages) == 2
+    other = tmp_path / "cache" / f"{tmp_path.name}_0a1b"
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(other.parent))
+    with demo._second_core() as compiled:
+        compiled(lambda *stage: stages.append(stage))
+    assert len(stages) == 4
+    other.mkdir(parents=True)
+    (other / "kernels.nbi").touch()
+    with demo._second_core() as compiled:
+        compiled(lambda *stage: stages.append(stage))
+    assert len(stages) == 4
 
 
 @pytest.mark.slow
