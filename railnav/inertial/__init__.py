@@ -42,6 +42,13 @@ from railnav.inertial.calibration import (
     turned_rate,
     vector_calibration,
 )
+from railnav.inertial.diagnosis import (
+    CAUSES,
+    Diagnosis,
+    ScalarControl,
+    diagnose,
+    scalar_control,
+)
 from railnav.inertial.mechanization import (
     EARTH_RATE,
     GravityField,
@@ -52,16 +59,19 @@ from railnav.inertial.mechanization import (
 from railnav.inertial.sensors import GRADES, SensorGrade, TriadModel, TriadSamples, misalignment_matrix, simulate_triad
 
 __all__ = [
+    "CAUSES",
     "EARTH_RATE",
     "GRADES",
     "Alignment",
     "AllanCurve",
+    "Diagnosis",
     "FineAlignment",
     "GravityField",
     "NavigationState",
     "NoiseParameters",
     "Position",
     "Rest",
+    "ScalarControl",
     "SensorGrade",
     "Solvability",
     "TemperaturePolynomial",
@@ -75,6 +85,7 @@ __all__ = [
     "allan_deviation",
     "coarse_align",
     "compass_heading",
+    "diagnose",
     "fine_align",
     "finite_rotation",
     "fit_allan",
@@ -90,6 +101,7 @@ __all__ = [
     "multi_position",
     "position_mean",
     "rest",
+    "scalar_control",
     "simulate_triad",
     "six_position",
     "solvability",
