@@ -105,7 +105,7 @@ class ChainFilter:
     ...     if live.epoch >= 0:
     ...         live.couple([[-1.0]], [[1.0]], [1.0])
     ...     block = live.observe([[1.0]], [measured])
-    >>> float(live.estimate().state[0]), round(block.nis, 6)
+    >>> round(float(live.estimate().state[0]), 6), round(block.nis, 6)
     (1.9625, 0.010417)
     """
 

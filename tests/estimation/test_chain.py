@@ -391,6 +391,19 @@ def test_rows_of_zeros_are_absent() -> None:
     agree(Chain(H, z, chain.M, chain.L, chain.u, prior=chain.prior))
 
 
+def test_couplings_padded_with_zeros_are_as_those_without() -> None:
+    chain = random_chain(16, 3)
+    pad = ((0, 0), (1, 2), (0, 0))
+    padded = Chain(
+        chain.H, chain.z, np.pad(chain.M, pad), np.pad(chain.L, pad), np.pad(chain.u, pad[:2], constant_values=7.0),
+        counts=chain.counts, prior=chain.prior,
+    )  # fmt: skip
+    plain, same = solve_chain(chain), solve_chain(padded)
+    np.testing.assert_array_equal(same.state, plain.state)
+    assert not same.coupling_dof.any()
+    assert not same.coupling_nis.any()
+
+
 def test_values_beyond_the_count_may_be_anything() -> None:
     chain = random_chain(10, 3)
     H, z = chain.H.copy(), chain.z.copy()
