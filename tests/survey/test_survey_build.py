@@ -395,20 +395,25 @@ def test_a_lever_arm_leans_with_the_cant():
 
     from railnav.run import GaugeStream
 
-    arm = np.array([2.0, 0.4, -3.6])
+    arm = np.array([0.0, 0.4, -3.6])
     frame, rng = plane(), np.random.default_rng(8)
     axis = centre_line(25, 3.0, frame=frame)
     cant = 45.0 * axis.curvature  # 150 mm at 300 m; a curve to the right lifts the left rail
-    lean = arm[1] * np.cos(np.arcsin(cant / 1.5)) - arm[2] * cant / 1.5
     runs = []
     for i in range(3):
-        run = drive(axis.shifted(lean), frame, rng, run_id=f"{i}", direction="up", stop=0.0)
+        back = (
+            i == 2
+        )  # the third run goes the other way: left and right change places, and so does the sign of the cant
+        sense = -1.0 if back else 1.0
+        lean = arm[1] * np.cos(np.arcsin(cant / 1.5)) - arm[2] * sense * cant / 1.5
+        run = drive(axis.shifted(sense * lean), frame, rng, run_id=f"{i}", direction="up", stop=0.0, backwards=back)
         e, n, h = frame.to_grid(run.gnss.latitude, run.gnss.longitude, run.gnss.height)
         _, at = axis.right_of(e, n)
-        gauge = GaugeStream(time=run.gnss.time, gauge=np.full(len(at), 1.435), cant=cant[at])
+        gauge = GaugeStream(time=run.gnss.time, gauge=np.full(len(at), 1.435), cant=sense * cant[at])
         runs.append(replace(run, gnss=replace(run.gnss, lever_arm_b=arm, height=h + 3.6), gauge=gauge))
     model = build(runs)
     assert rms(model, "up", axis) < 0.016
+    assert all(run["fixes"]["used"] > 0.98 * run["fixes"]["total"] for run in report(model)["runs"])
     k = knots(model, "up")
     _, at = axis.right_of(model.easting[k], model.northing[k])
     assert np.abs(model.cant[k] - cant[at])[20:-20].max() < 0.02

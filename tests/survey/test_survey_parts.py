@@ -1,16 +1,22 @@
 """Frame offsets, error models, nominal curves and grouping, each on its own."""
 
+from datetime import UTC, datetime
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from railnav.run import Run
 from railnav.survey import _kernels
+from railnav.survey.axis import ErrorModel
+from railnav.survey.fixes import Fixes
 from railnav.survey.grouping import tracks_of_line
 from railnav.survey.noise import Sample, error_models, run_models
 from railnav.survey.nominal import curve, lines, smooth_course
 from railnav.survey.offsets import Knowledge, differences, settle
-from railnav.survey.surveyed import know
+from railnav.survey.profiles import Profiles, traverse
+from railnav.survey.surveyed import know, white_variances
 
 
 def bends(N=600):
@@ -168,16 +174,63 @@ def test_walking_along_a_curve_finds_offset_and_distance_to_the_right(s, d):
 
 
 def test_a_walk_stays_on_its_branch_where_a_line_crosses_itself():
-    t = np.linspace(0.05 * np.pi, 1.95 * np.pi, 1500)
+    t = np.linspace(0.3 * np.pi, 2.2 * np.pi, 1500)
     eight = np.column_stack([1500.0 * np.sin(t), 1500.0 * np.sin(t) * np.cos(t)])
     nominal = curve(eight[:, 0], eight[:, 1], 10.0)
+    along = np.gradient(eight, axis=0)
+    along /= np.hypot(*along.T)[:, None]
+    beside = eight + 25.0 * np.column_stack(
+        [along[:, 1], -along[:, 0]]
+    )  # nearer to the other branch, about the crossing
     s, d = np.empty(len(eight)), np.empty(len(eight))
     _kernels.walk(
         nominal.easting, nominal.northing, nominal.tangent_e, nominal.tangent_n, nominal.step,
-        np.ascontiguousarray(eight[:, 0]), np.ascontiguousarray(eight[:, 1]), 60.0, s, d,
+        np.ascontiguousarray(beside[:, 0]), np.ascontiguousarray(beside[:, 1]), 60.0, s, d,
     )  # fmt: skip
     assert (np.diff(s) > 0).all()
-    assert np.abs(d).max() < 0.01
+    assert np.abs(d - 25.0).max() < 0.05
+
+
+@pytest.mark.parametrize("sense", [1, -1])
+def test_the_antenna_is_brought_to_the_reference_point(sense):
+    points, _ = arc()
+    nominal = curve(points[:, 0], points[:, 1], 10.0)
+    s = np.linspace(100.0, 800.0, 60)[::sense]
+    antenna, radius = s + sense * 5.0, 400.0 - sense * 1.2  # 5 m ahead and 1.2 m to the vehicle's right
+    fixes = Fixes(
+        run=Run(id="a", start=datetime(2026, 5, 4, tzinfo=UTC)),
+        receiver="r",
+        time=np.arange(60.0),
+        easting=400.0 - radius * np.cos(antenna / 400.0),
+        northing=radius * np.sin(antenna / 400.0),
+        height=np.zeros(60),
+        sigma=np.ones(60),
+        reason=np.zeros(60, np.int64),
+        size=np.zeros(60),
+        forward=5.0,
+        right=np.full(60, 1.2),
+    )
+    laid = traverse(nominal, fixes, 60.0)
+    assert laid.sense == sense
+    assert laid.offset == pytest.approx(s, abs=0.01)
+    assert laid.right == pytest.approx(np.zeros(60), abs=0.01)
+
+
+def test_doubtful_values_lose_weight_and_others_do_not():
+    N = 200
+    profile = Profiles(
+        *(np.ones((1, N)) for _ in range(5)), time=np.arange(N, dtype=float)[None], sigma=np.full((1, N), 0.5)
+    )
+    profile.sigma[0, 50] = 2.0
+    residual = np.full((1, N), 1.0)
+    residual[0, 100] = 4.0
+    residual[0, 150] = np.nan
+    (variance,) = white_variances(profile, residual, [ErrorModel(0.2, 1.0, 30.0, 1.02)], 0.0)
+    usual = np.delete(variance, [50, 100, 150])
+    assert usual == pytest.approx(0.04)
+    assert variance[100] > 60 * 0.5 * 1.02**2  # as much as a correlated error of that size, over its whole memory
+    assert variance[50] > 60 * 0.5 * 1.02**2
+    assert np.isnan(variance[150])
 
 
 def test_lines_join_what_continues_and_keep_apart_what_parts():
