@@ -22,11 +22,11 @@ OFFSET, EAST, NORTH, D_EAST, D_NORTH, CURVATURE, GRADIENT, CANT = range(8)
 P_EAST, P_NORTH, P_D_EAST, P_D_NORTH, P_CURVATURE, P_GRADIENT, P_CANT, P_GRADIENT_RATE = range(8)
 POINT_SIZE = 8
 #: Integer marks of a hypothesis.
-COUNT, CURRENT, RECORD, VERSION, MOVED, SLIPS, LINEAGE = range(7)
-TAGS = 7
-#: Real-valued marks of a hypothesis: time the slip began (-inf: none), time since when the wheel agrees again.
-SLIP_SINCE, AGREE_SINCE = range(2)
-INFO = 2
+COUNT, CURRENT, RECORD, VERSION, MOVED, SIGN = range(6)
+TAGS = 6
+#: Real-valued marks of a hypothesis: time the slip began (-inf: none), time since when the wheel agrees again, evidence that fades.
+SLIP_SINCE, AGREE_SINCE, FADING = range(3)
+INFO = 3
 #: A boundary this far out of reach is armed: its switch may have been thrown, m.
 ARM_DISTANCE = 20.0
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from railnav.matching._kernels import (
     AGREE_SINCE,
     CURRENT,
+    FADING,
     MOVED,
     P_CANT,
     P_CURVATURE,
@@ -27,10 +28,12 @@ from railnav.matching._kernels import (
     P_NORTH,
     POINT_SIZE,
     RECORD,
+    SIGN,
     SLIP_SINCE,
     VERSION,
     COUNT,
     add_column,
+    clone,
     drop,
     follow,
     leaving_end,
@@ -53,6 +56,7 @@ FRAME_EAST, FRAME_NORTH, GNSS_EAST, GNSS_NORTH = (
     int(State.GNSS_EAST),
     int(State.GNSS_NORTH),
 )
+TIME_TAG, SPEED_LATENCY, SPEED_ERROR = int(State.TIME_TAG), int(State.SPEED_LATENCY), int(State.SPEED_ERROR)
 ODOMETER_SCALE, GYRO_BIAS, ACCELEROMETER_BIAS = (
     int(State.ODOMETER_SCALE),
     int(State.GYRO_BIAS),
@@ -78,15 +82,22 @@ INITIALISING, TRACKING, COASTING, AMBIGUOUS, OFF_MODEL, LOST = (
 K_GNSS_TIME = SETTING["gnss_correlation_time"]
 K_CORRELATED = SETTING["gnss_correlated_share"]
 K_WHITE = SETTING["gnss_white_share"]
+K_FRAME = SETTING["gnss_frame_share"]
+K_FRAME_LEAST = SETTING["frame_sigma_least"]
+K_MODEL = SETTING["model_sigma"]
 K_FRAME_MOST = SETTING["frame_sigma_most"]
+K_SCALE_START = SETTING["scale_start"]
 K_SCALE_PRIOR = SETTING["scale_prior"]
 K_SCALE_LEAST = SETTING["scale_least"]
 K_SCALE_MOST = SETTING["scale_most"]
 K_GATE = SETTING["gate"]
 K_STEP_FIXES = SETTING["step_fixes"]
 K_LOST_AFTER = SETTING["lost_after"]
+K_TAG_WALK = SETTING["time_tag_walk"]
+K_TAG_MOST = SETTING["time_tag_most"]
 K_SPEED_SIGMA = SETTING["speed_sigma"]
-K_SPEED_LATENCY = SETTING["speed_latency"]
+K_SPEED_SHARE = SETTING["speed_error_share"]
+K_SPEED_TIME = SETTING["speed_error_time"]
 K_COURSE_SIGMA = SETTING["course_sigma"]
 K_ACC_SIGMA = SETTING["acceleration_sigma"]
 K_ACC_TIME = SETTING["acceleration_time"]
@@ -111,6 +122,7 @@ K_CONFIDENCE = SETTING["track_confidence"]
 K_COASTING = SETTING["coasting_after"]
 K_LOST_SIGMA = SETTING["lost_sigma"]
 K_USABLE = SETTING["sigma_usable"]
+K_MEMORY = SETTING["evidence_memory"]
 K_MERGE = SETTING["merge_distance"]
 K_PRUNE = SETTING["prune_below"]
 K_MOST = SETTING["most_hypotheses"]
@@ -185,22 +197,33 @@ OUTPUT_SIZE = 13
     C_STARTS,
     C_REVISIONS,
     C_RING,
-) = range(29)
-COMMON_SIZE = 29
+    C_SPEED_STALE,  # 1: the receiver repeats its last speed to the last digit: no news
+    C_STOOD,  # 1: the train stood at the epoch before
+    C_JUMPS,  # steps lately, forgotten over half a minute
+    C_FRAME_TIME,  # when the constant part's prior was last looked at
+    C_DISTRUST,  # until when a receiver's resting speed is not believed: its positions moved meanwhile
+) = range(34)
+COMMON_SIZE = 34
 #: Odometer readings remembered: time, distance.
 RING = 32
 #: Wheel speed is the mean over this long, s.
 WHEEL_SPAN = 0.5
-#: Standard deviations that forget the wheel distance (m), the GNSS error (in sigmas) and shake the speed (m/s).
-FORGET_WHEEL, FORGET_GNSS, SHAKE_SPEED = 10.0, 3.0, 0.1
+#: Standard deviations that forget the wheel distance (m) and shake the speed (m/s).
+FORGET_WHEEL, SHAKE_SPEED = 10.0, 0.1
+#: How long a receiver that said "at rest" while its positions moved is not believed, s.
+DISTRUST = 300.0
+#: Acceleration of a departing train, m/s^2.
+KICK = 0.7
 #: Random walk of the speed while an accelerometer that should be there is silent, m/s^2/sqrt(Hz).
 SILENT_NOISE = 0.4
 #: Squared normalised innovation at which a single sensor row is held; its evidence saturates there.
 ROW_GATE = 16.0
 
 #: Columns of a record's numbers, kept for the smoother.
-R_EPOCH, R_PARENT, R_VERSION, R_LOGW, R_PULL, R_SLIP, R_SHAKE, R_STEP = range(8)
-RECORD_SIZE = 8
+R_EPOCH, R_PARENT, R_VERSION, R_LOGW, R_PULL, R_SLIP, R_SHAKE, R_STEP, R_TAG, R_SIGN = range(10)
+RECORD_SIZE = 10
+#: Those of them that the filter fills as it goes: from R_PULL on.
+PULLS = 6
 
 #: Why the loop stopped.
 DONE, NEEDS_START, NEEDS_ROOM = range(3)
@@ -290,11 +313,11 @@ def antenna(point, lever, out):  # (POINT_SIZE,), (3,) -> out (4,): easting, nor
 
 
 @njit(cache=True)
-def transition(fil, x, dt, force, pull, slip, shake, step, F, Q, lead, new):
+def transition(fil, x, dt, sign, force, pull, slip, shake, step, tag, F, Q, lead, new):
     """Fill the transition matrix F (lower triangular), the noise columns Q with their first rows and the predicted state (19.2).
 
-    `pull` is g sin(grade); slip, shake, step are variances that forget the wheel distance, shake the speed and let the GNSS error
-    step. Gives the number of noise columns.
+    `sign` is the direction in which an unsigned odometer counts; `pull` is g sin(grade); slip, shake, step, tag are variances that forget the wheel distance, shake the speed and let the GNSS
+    error and its time stamps jump. Gives the number of noise columns.
     """
     # x (n,), F (n, n), Q (12, n) one noise column a row, lead (12,), new (n,)
     at = fil.at
@@ -311,6 +334,12 @@ def transition(fil, x, dt, force, pull, slip, shake, step, F, Q, lead, new):
     F[i_ge + 1, i_ge + 1] = phi
     new[i_ge] = phi * x[i_ge]
     new[i_ge + 1] = phi * x[i_ge + 1]
+    i_e = at[SPEED_ERROR]
+    fade = 1.0
+    if i_e >= 0:
+        fade = math.exp(-dt / k[K_SPEED_TIME])
+        F[i_e, i_e] = fade
+        new[i_e] = fade * x[i_e]
     v = x[i_v]
     F[i_s, i_v] = dt
     i_a = at[ACCELERATION]
@@ -343,7 +372,6 @@ def transition(fil, x, dt, force, pull, slip, shake, step, F, Q, lead, new):
     rate = 0.0
     if i_d >= 0:
         i_k = at[ODOMETER_SCALE]
-        sign = 1.0 if (fil.signed == 1 or v >= 0.0) else -1.0
         rate = sign * (1.0 + x[i_k])
         new[i_d] = x[i_d] + rate * ds
         F[i_d, i_k] = sign * ds
@@ -357,6 +385,17 @@ def transition(fil, x, dt, force, pull, slip, shake, step, F, Q, lead, new):
             Q[c, j] = 0.0
         Q[c, i_ge + i] = math.sqrt(1.0 - phi * phi + step)
         lead[c] = i_ge + i
+        c += 1
+    for j in range(n):
+        Q[c, j] = 0.0
+    Q[c, at[TIME_TAG]] = math.sqrt(k[K_TAG_WALK] ** 2 * dt + tag)
+    lead[c] = at[TIME_TAG]
+    c += 1
+    if i_e >= 0:
+        for j in range(n):
+            Q[c, j] = 0.0
+        Q[c, i_e] = math.sqrt(1.0 - fade * fade)
+        lead[c] = i_e
         c += 1
     root = math.sqrt(dt)
     for which in range(3):
@@ -406,6 +445,12 @@ def transition(fil, x, dt, force, pull, slip, shake, step, F, Q, lead, new):
         Q[c, i_v] = math.sqrt(shake)
         lead[c] = i_v
         c += 1
+        if i_a >= 0:
+            for j in range(n):
+                Q[c, j] = 0.0
+            Q[c, i_a] = KICK
+            lead[c] = i_a
+            c += 1
     if i_d >= 0:
         for j in range(n):
             Q[c, j] = 0.0
@@ -482,23 +527,27 @@ def robust_row(x, P_sqrt, h, innovation, variance, f, keep, move):
 
 
 @njit(cache=True)
-def reweigh_frame(x, P_sqrt, old, new, f, column):
-    """Widen the prior of the constant GNSS error from sigma `old` to `new` after the fact, exactly; gives the change of ln weight.
+def reweigh_frame(x, P_sqrt, old, new, f, column, keep, move):
+    """Change the prior of the constant GNSS error from sigma `old` to `new` after the fact, exactly; gives the change of ln weight.
 
-    Dividing the posterior by N(0, old^2) and multiplying by N(0, new^2) adds to P the rank-one term d k k^T / (1 - d P_ff) with
-    k = P e_f, d = 1/old^2 - 1/new^2, and to the evidence ln(old/new) - ln(1 - d P_ff)/2 + d f^2 / (2 (1 - d P_ff)).
+    Dividing the posterior by N(0, old^2) and multiplying by N(0, new^2) is, narrowing, one more row f = 0; widening, it adds to P
+    the rank-one term d k k^T / (1 - d P_ff) with k = P e_f, d = 1/old^2 - 1/new^2. Either way the evidence changes by
+    ln(old/new) - ln(1 - d P_ff)/2 + d f^2 / (2 (1 - d P_ff)).
     """
     n = x.shape[0]
     d = 1.0 / (old * old) - 1.0 / (new * new)
     change = 0.0
     for axis in range(2):
         p = 0.0
-        for j in range(axis + 1):
-            f[j] = P_sqrt[axis, j]
+        for j in range(n):
+            f[j] = P_sqrt[axis, j] if j <= axis else 0.0
             p += f[j] * f[j]
         room = max(1.0 - d * p, 1e-9)
         mean = x[axis]
         change += math.log(old / new) - 0.5 * math.log(room) + 0.5 * d * mean * mean / room
+        if d < 0.0:
+            absorb(x, P_sqrt, f, -mean, -1.0 / d, keep, move)
+            continue
         root = math.sqrt(d / room)
         for i in range(n):
             t = 0.0
@@ -595,6 +644,11 @@ def wheel_row(fil, shared, bank, h, time, distance, h_row, f, keep, move, column
                 column[j] = 0.0
             column[i_v] = SHAKE_SPEED
             add_column(P_sqrt, column, i_v)
+            if at[ACCELERATION] >= 0:
+                for j in range(n):
+                    column[j] = 0.0
+                column[at[ACCELERATION]] = KICK
+                add_column(P_sqrt, column, at[ACCELERATION])
     elif agrees:
         if bank.info[h, AGREE_SINCE] == np.inf:
             bank.info[h, AGREE_SINCE] = time
@@ -630,6 +684,21 @@ K_SLIP_EVIDENCE = 16.0
 
 
 @njit(cache=True)
+def direction(fil, bank, h):
+    """Which way an unsigned speed or distance counts: by the estimate where that is certain, else as the hypothesis has it."""
+    if fil.signed == 1:
+        return 1.0
+    i_v = fil.at[SPEED]
+    v = bank.x[h, i_v]
+    p = 0.0
+    for j in range(i_v + 1):
+        p += bank.P_sqrt[h, i_v, j] ** 2
+    if v * v > 9.0 * p:
+        bank.tags[h, SIGN] = 1 if v > 0.0 else -1
+    return float(bank.tags[h, SIGN])
+
+
+@njit(cache=True)
 def motion_rows(fil, net, shared, bank, h, row, dt, still, point, probe, h_row, f, keep, move):
     """Standstill, odometer speed, yaw gyro, GNSS speed and course of one hypothesis; gives ln p."""
     at = fil.at
@@ -644,7 +713,7 @@ def motion_rows(fil, net, shared, bank, h, row, dt, still, point, probe, h_row, 
     wheel = row[WHEEL_SPEED]
     if wheel == wheel and i_k >= 0:  # (1 + k) |v|
         sigma = row[SIGMA_WHEEL] if row[SIGMA_WHEEL] > 0.0 else k[K_ODOMETER_SPEED]
-        sign = 1.0 if (fil.signed == 1 or x[i_v] >= 0.0) else -1.0
+        sign = direction(fil, bank, h)
         h_row[i_v] = sign * (1.0 + x[i_k])
         h_row[i_k] = sign * x[i_v]
         innovation = wheel - sign * (1.0 + x[i_k]) * x[i_v]
@@ -693,19 +762,42 @@ def motion_rows(fil, net, shared, bank, h, row, dt, still, point, probe, h_row, 
         h_row[i_v] = 0.0
         h_row[i_g] = 0.0
     speed = row[GNSS_SPEED]
-    if speed == speed:
+    i_l, i_e = at[SPEED_LATENCY], at[SPEED_ERROR]
+    if speed == speed and i_l >= 0 and shared.common[C_SPEED_STALE] == 0.0:
         v = x[i_v]
         stated = row[SIGMA_SPEED] > 0.0
         sigma = row[SIGMA_SPEED] if stated else k[K_SPEED_SIGMA]
-        if not stated and at[ACCELERATION] >= 0:
-            sigma = math.hypot(sigma, k[K_SPEED_LATENCY] * x[at[ACCELERATION]])
-        h_row[i_v] = 1.0
         if speed < 4.0 * sigma and abs(v) < 8.0 * sigma:  # the sign is not told: near standstill
+            h_row[i_v] = 1.0
             evidence += robust_row(x, P_sqrt, h_row, -v, speed * speed + sigma * sigma, f, keep, move)
-        else:
-            signed = speed if v >= 0.0 else -speed
-            evidence += robust_row(x, P_sqrt, h_row, signed - v, sigma * sigma, f, keep, move)
-        h_row[i_v] = 0.0
+            h_row[i_v] = 0.0
+        else:  # |v - latency a| + error
+            sign = float(bank.tags[h, SIGN])
+            if row[COURSE_EAST] == row[COURSE_EAST]:
+                sign = 1.0 if row[COURSE_EAST] * point[P_D_EAST] + row[COURSE_NORTH] * point[P_D_NORTH] > 0.0 else -1.0
+            elif fil.signed == 0:
+                sign = direction(fil, bank, h)
+            elif abs(v) > 0.5:
+                sign = 1.0 if v > 0.0 else -1.0
+            i_a = at[ACCELERATION]
+            a = 0.0
+            if i_a >= 0:
+                a = x[i_a]
+                h_row[i_a] = -sign * x[i_l]
+            elif row[FORCE] == row[FORCE]:
+                g0 = point[P_GRADIENT]
+                a = row[FORCE] - x[at[ACCELEROMETER_BIAS]] - k[K_GRAVITY] * g0 / math.sqrt(1.0 + g0 * g0)
+            share = k[K_SPEED_SHARE] * sigma
+            h_row[i_v] = sign
+            h_row[i_l] = -sign * a
+            h_row[i_e] = share
+            innovation = speed - sign * (v - x[i_l] * a) - share * x[i_e]
+            evidence += robust_row(x, P_sqrt, h_row, innovation, sigma * sigma, f, keep, move)
+            h_row[i_v] = 0.0
+            h_row[i_l] = 0.0
+            h_row[i_e] = 0.0
+            if i_a >= 0:
+                h_row[i_a] = 0.0
         v = x[i_v]
         course = row[COURSE_EAST]
         if course == course and speed > 1.0 and abs(v) > 1.0:
@@ -754,14 +846,19 @@ def position_row(fil, net, shared, bank, h, row, point, probe, place, h_east, h_
         h_north[j] = 0.0
     extra_east = 0.0
     extra_north = 0.0
+    i_t, i_v = at[TIME_TAG], at[SPEED]
+    seen = x[i_s] + x[i_v] * x[i_t]  # where the fix shows the train
+    step = seen - point[POINT_SIZE]
     if abs(point[P_CURVATURE]) * spread > 0.1 or spread > 400.0:
         sd = math.sqrt(spread)
         mean_e = 0.0
         mean_n = 0.0
         slope_e = 0.0
         slope_n = 0.0
+        base_e = 0.0
+        base_n = 0.0
         for m in range(5):
-            path_point(net, bank, h, x[i_s] + GAUSS_HERMITE_NODES[m] * sd, probe)
+            path_point(net, bank, h, seen + GAUSS_HERMITE_NODES[m] * sd, probe)
             antenna(probe, fil.lever, place)
             w = GAUSS_HERMITE_WEIGHTS[m]
             if m == 0:
@@ -779,14 +876,24 @@ def position_row(fil, net, shared, bank, h, row, point, probe, place, h_east, h_
         h_north[i_s] = slope_n / sd
         at_east = base_e + mean_e
         at_north = base_n + mean_n
+    elif abs(step) > 2.0:
+        path_point(net, bank, h, seen, probe)
+        antenna(probe, fil.lever, place)
+        h_east[i_s] = place[2]
+        h_north[i_s] = place[3]
+        at_east = place[0]
+        at_north = place[1]
     else:
         antenna(point, fil.lever, place)
-        step = x[i_s] - point[POINT_SIZE]
         bend = 0.5 * step * step * point[P_CURVATURE]
         h_east[i_s] = place[2]
         h_north[i_s] = place[3]
         at_east = place[0] + step * place[2] + bend * place[3]
         at_north = place[1] + step * place[3] - bend * place[2]
+    h_east[i_t] = x[i_v] * h_east[i_s]
+    h_north[i_t] = x[i_v] * h_north[i_s]
+    h_east[i_v] = x[i_t] * h_east[i_s]
+    h_north[i_v] = x[i_t] * h_north[i_s]
     scale = common[C_SCALE] * k[K_CORRELATED]
     h_east[i_g] = scale * common[C_SIGMA_EAST]
     h_north[i_g + 1] = scale * common[C_SIGMA_NORTH]
@@ -801,6 +908,9 @@ def position_row(fil, net, shared, bank, h, row, point, probe, place, h_east, h_
     s_en = 0.0
     for j in range(n):
         s_en += f_east[j] * f_north[j]
+    two[4] = s_ee
+    two[5] = s_nn
+    two[6] = s_en
     det = s_ee * s_nn - s_en * s_en
     nis = (two[0] * two[0] * s_nn - 2.0 * two[0] * two[1] * s_en + two[1] * two[1] * s_ee) / det
     return nis, math.log(det)
@@ -822,7 +932,10 @@ def watch(fil, shared, bank, row):
             a = 1.0
         common[C_SIGMA_EAST] += a * (row[SIGMA_EAST] - common[C_SIGMA_EAST])
         common[C_SIGMA_NORTH] += a * (row[SIGMA_NORTH] - common[C_SIGMA_NORTH])
+    common[C_SPEED_STALE] = 0.0
     if row[GNSS_SPEED] == row[GNSS_SPEED]:
+        if row[GNSS_SPEED] == common[C_GNSS_SPEED] and (row[GNSS_SPEED] > 0.01 or time < common[C_DISTRUST]):
+            common[C_SPEED_STALE] = 1.0
         common[C_GNSS_SPEED] = row[GNSS_SPEED]
         common[C_GNSS_SPEED_TIME] = time
         if row[GNSS_SPEED] > max(0.3, 0.0 if not row[SIGMA_SPEED] > 0.0 else min(3.0 * row[SIGMA_SPEED], 0.6)):
@@ -860,13 +973,13 @@ def stands(fil, shared, bank, time):
         if common[C_GNSS_SPEED_TIME] > time - 2.5 and common[C_GNSS_SPEED] > 1.0:
             return False
         return time - common[C_WHEEL_MOVED] >= k[K_STILL_TIME]
-    if common[C_GNSS_SPEED_TIME] > time - 2.5:
+    if common[C_GNSS_SPEED_TIME] > time - 2.5 and common[C_SUSPECTS] == 0.0 and time > common[C_DISTRUST]:
         return time - common[C_GNSS_STILL] >= 3.0 * k[K_STILL_TIME]
     return False
 
 
 @njit(cache=True)
-def adapt(fil, shared, bank, row, point, dt, f, column):
+def adapt(fil, shared, bank, time, point, dt, f, column, keep, move):
     """Learn the scale of the receiver's sigmas and, where fixes lie aside for good, widen the constant part's prior exactly."""
     k = fil.settings
     common = shared.common
@@ -883,21 +996,85 @@ def adapt(fil, shared, bank, row, point, dt, f, column):
         value = (tn * x[i_g] - te * x[i_g + 1]) ** 2
         for j in range(i_g + 2):
             value += (tn * L[i_g, j] - te * L[i_g + 1, j]) ** 2
-        square += shared.weight[h] * value / size
-        frame += shared.weight[h] * (x[0] * x[0] + x[1] * x[1])
+        square += shared.weight[h] * min(value / size, 9.0)
+        frame += shared.weight[h] * (
+            x[0] * x[0] + x[1] * x[1] + L[0, 0] * L[0, 0] + L[1, 0] * L[1, 0] + L[1, 1] * L[1, 1]
+        )
     fade = math.exp(-dt / 3600.0)
     part = min(0.5 * dt / k[K_GNSS_TIME], 1.0)
     common[C_SCALE_SUM] = fade * common[C_SCALE_SUM] + part * square * common[C_SCALE] ** 2
     common[C_SCALE_WEIGHT] = fade * common[C_SCALE_WEIGHT] + part
-    scale = math.sqrt((k[K_SCALE_PRIOR] + common[C_SCALE_SUM]) / (k[K_SCALE_PRIOR] + common[C_SCALE_WEIGHT]))
+    scale = math.sqrt(
+        (k[K_SCALE_PRIOR] * k[K_SCALE_START] ** 2 + common[C_SCALE_SUM]) / (k[K_SCALE_PRIOR] + common[C_SCALE_WEIGHT])
+    )
     common[C_SCALE] = min(max(scale, k[K_SCALE_LEAST]), k[K_SCALE_MOST])
+    # the constant part's prior follows what is seen of it (expectation-maximisation), once a minute
+    if time - common[C_FRAME_TIME] < 60.0:
+        return
+    common[C_FRAME_TIME] = time
     old = common[C_FRAME_SIGMA]
-    if frame > 6.0 * old * old and old < k[K_FRAME_MOST]:
-        new = min(1.5 * old, k[K_FRAME_MOST])
+    least = k[K_FRAME] * 0.5 * (common[C_SIGMA_EAST] + common[C_SIGMA_NORTH])
+    least = min(max(math.hypot(least, k[K_MODEL]), k[K_FRAME_LEAST]), k[K_FRAME_MOST])
+    new = min(max(math.sqrt(0.5 * frame), old / 1.5, least), 1.5 * old, k[K_FRAME_MOST])
+    if abs(new / old - 1.0) > 0.2:
         for i in range(bank.live[0]):
             h = bank.live[1 + i]
-            bank.logw[h] += reweigh_frame(bank.x[h], bank.P_sqrt[h], old, new, f, column)
+            bank.logw[h] += reweigh_frame(bank.x[h], bank.P_sqrt[h], old, new, f, column, keep, move)
         common[C_FRAME_SIGMA] = new
+
+
+@njit(cache=True)
+def jump(fil, net, shared, bank, nis, row, point, probe, place, h_east, h_north, f_east, f_north, two):
+    """What stepped when fixes have left every hypothesis: variances for the GNSS error (in its own units) and for the time stamps.
+
+    A jump along the track that the speed turns into less than `time_tag_most` seconds is one of the stamps.
+    """
+    k = fil.settings
+    best = bank.live[1]
+    for i in range(bank.live[0]):
+        if nis[bank.live[1 + i]] < nis[best]:
+            best = bank.live[1 + i]
+    position_row(fil, net, shared, bank, best, row, point[best], probe, place, h_east, h_north, f_east, f_north, two)
+    te, tn = point[best, P_D_EAST], point[best, P_D_NORTH]
+    size = math.hypot(te, tn)
+    along = (two[0] * te + two[1] * tn) / size
+    cross = (two[0] * tn - two[1] * te) / size
+    across = (two[4] * tn * tn - 2.0 * two[6] * te * tn + two[5] * te * te) / (size * size)
+    v = bank.x[best, fil.at[SPEED]]
+    if abs(v) > 3.0 and abs(along / v) <= k[K_TAG_MOST] and cross * cross < k[K_GATE] * across:
+        return 0.0, (along / v) ** 2
+    sigma = shared.common[C_SCALE] * k[K_CORRELATED] * shared.common[C_SIGMA_EAST]
+    return max((two[0] ** 2 + two[1] ** 2) / (sigma * sigma), 1.0), 0.0
+
+
+@njit(cache=True)
+def depart(fil, bank, pulls):
+    """A train that stood leaves, and nothing tells which way: a clone of each hypothesis that has moved before goes back."""
+    reverse = fil.settings[K_REVERSE]
+    for i in range(bank.live[0]):
+        h = bank.live[1 + i]
+        if bank.tags[h, MOVED] == 1 and bank.live[0] < bank.used.shape[0]:
+            g = clone(bank, h)
+            bank.tags[g, SIGN] = -bank.tags[h, SIGN]
+            bank.logw[g] += math.log(reverse)
+            bank.logw[h] += math.log(1.0 - reverse)
+            pulls[g] = pulls[h]
+
+
+@njit(cache=True)
+def kick(fil, bank, row, pulls, column):
+    """A train that stood leaves: its acceleration is anything a train can do, and its speed what the receiver may already say."""
+    i_v, i_a = fil.at[SPEED], fil.at[ACCELERATION]
+    sigma = 0.3 + (row[GNSS_SPEED] if row[GNSS_SPEED] == row[GNSS_SPEED] else 0.0)
+    for i in range(bank.live[0]):
+        h = bank.live[1 + i]
+        for state in range(2):
+            column[:] = 0.0
+            where = i_a if state == 0 else i_v
+            if where >= 0:
+                column[where] = KICK if state == 0 else sigma
+                add_column(bank.P_sqrt[h], column, where)
+        pulls[h, 2] = sigma * sigma
 
 
 @njit(cache=True)
@@ -1060,7 +1237,7 @@ def keep_records(bank, records, epoch, pulls):
         numbers[R_PARENT] = bank.tags[h, RECORD]
         numbers[R_VERSION] = bank.tags[h, VERSION]
         numbers[R_LOGW] = bank.logw[h]
-        for j in range(4):
+        for j in range(PULLS):
             numbers[R_PULL + j] = pulls[h, j]
         bank.tags[h, RECORD] = r
         used[0] = r + 1
@@ -1077,8 +1254,8 @@ def run(fil, net, shared, bank, records, epochs, first, out):
     slots = bank.x.shape[0]
     i_s, i_v, i_d = at[POSITION], at[SPEED], at[WHEEL_DISTANCE]
     F = np.empty((n, n))
-    Q = np.empty((14, n))
-    lead = np.empty(14, np.int64)
+    Q = np.empty((16, n))
+    lead = np.empty(16, np.int64)
     new = np.empty(n)
     h_row = np.empty(n)
     h_two = np.empty(n)
@@ -1088,12 +1265,13 @@ def run(fil, net, shared, bank, records, epochs, first, out):
     move = np.empty(n)
     column = np.empty(n)
     before = np.empty(n)
-    two = np.empty(4)
+    two = np.empty(7)
     place = np.empty(4)
     probe = np.empty(POINT_SIZE + 1)
     point = np.empty((slots, POINT_SIZE + 1))
-    pulls = np.zeros((slots, 4))
+    pulls = np.zeros((slots, PULLS))
     nis = np.empty(slots)
+    said = np.empty(slots)
     mass = np.empty(slots)
     mean = np.empty(slots)
     sigma = np.empty(slots)
@@ -1121,13 +1299,15 @@ def run(fil, net, shared, bank, records, epochs, first, out):
             h = bank.live[1 + i]
             x = bank.x[h]
             P_sqrt = bank.P_sqrt[h]
-            for j in range(4):
+            for j in range(PULLS):
                 pulls[h, j] = 0.0
             if dt > 0.0:
                 path_point(net, bank, h, x[i_s] + 0.5 * dt * x[i_v], probe)
                 g0 = probe[P_GRADIENT]
                 pull = k[K_GRAVITY] * g0 / math.sqrt(1.0 + g0 * g0)
-                columns = transition(fil, x, dt, row[FORCE], pull, 0.0, 0.0, 0.0, F, Q, lead, new)
+                sign = direction(fil, bank, h)
+                pulls[h, 5] = sign
+                columns = transition(fil, x, dt, sign, row[FORCE], pull, 0.0, 0.0, 0.0, 0.0, F, Q, lead, new)
                 predict(x, P_sqrt, F, Q, lead, columns, new)
                 pulls[h, 0] = pull
             i += 1
@@ -1145,7 +1325,7 @@ def run(fil, net, shared, bank, records, epochs, first, out):
             ends = follow(net, bank, h, x[i_s], x[i_v], margin)
             for m in range(before_count, bank.live[0]):
                 g = bank.live[1 + m]
-                for j in range(4):
+                for j in range(PULLS):
                     pulls[g, j] = pulls[h, j]
             bank.tags[h, CURRENT] = path_index(net, bank, h, x[i_s], bank.tags[h, CURRENT])
             gone = sd > k[K_LOST_SIGMA]
@@ -1174,6 +1354,14 @@ def run(fil, net, shared, bank, records, epochs, first, out):
             put_out(fil, net, shared, bank, time, row, point, mass, mean, sigma, weights, probe, out[e])
             continue
         still = stands(fil, shared, bank, time)
+        if still:
+            common[C_STOOD] = 1.0
+        elif common[C_STOOD] == 1.0:
+            common[C_STOOD] = 0.0
+            if at[ACCELEROMETER_BIAS] < 0 and fil.signed == 0:
+                depart(fil, bank, pulls)
+            if at[ACCELEROMETER_BIAS] < 0:
+                kick(fil, bank, row, pulls, column)
         distance = row[DISTANCE]
         if distance == distance and i_d >= 0 and not shared.ring[(int(common[C_RING]) - 1) % RING, 0] > -np.inf:
             for i in range(bank.live[0]):  # first reading
@@ -1212,6 +1400,7 @@ def run(fil, net, shared, bank, records, epochs, first, out):
                 )
                 least = min(least, nis[h])
             step = 0.0
+            tag = 0.0
             accepted = True
             if least > k[K_GATE] and common[C_FRESH] == 0.0:
                 common[C_SUSPECT_FIXES] += 1.0
@@ -1220,9 +1409,12 @@ def run(fil, net, shared, bank, records, epochs, first, out):
                 common[C_SUSPECTS] += 1.0
                 accepted = False
                 if common[C_SUSPECTS] >= k[K_STEP_FIXES] and time - common[C_SUSPECT_SINCE] >= 1.0:
-                    step = FORGET_GNSS * FORGET_GNSS * max(1.0, least / k[K_GATE])
+                    step, tag = jump(fil, net, shared, bank, nis, row, point, probe, place, h_row, h_two, f, f_two, two)
                     accepted = True
                     common[C_STEPS] += 1.0
+                    if common[C_GNSS_SPEED] < 0.5 and at[SPEED_LATENCY] >= 0:
+                        common[C_DISTRUST] = time + DISTRUST
+                        kick(fil, bank, row, pulls, column)
             if accepted:
                 common[C_SUSPECTS] = 0.0
                 common[C_FIXES] += 1.0
@@ -1237,11 +1429,17 @@ def run(fil, net, shared, bank, records, epochs, first, out):
                             column[at[GNSS_EAST] + axis] = math.sqrt(step)
                             add_column(P_sqrt, column, at[GNSS_EAST] + axis)
                         pulls[h, 3] = step
+                    if tag > 0.0:
+                        for j in range(n):
+                            column[j] = 0.0
+                        column[at[TIME_TAG]] = math.sqrt(tag)
+                        add_column(P_sqrt, column, at[TIME_TAG])
+                        pulls[h, 4] = tag
                     value, logdet = position_row(
                         fil, net, shared, bank, h, row, point[h], probe, place, h_row, h_two, f, f_two, two
                     )
                     held = k[K_GATE] + 10.0 if common[C_FRESH] == 0.0 else 1e4
-                    bank.logw[h] -= 0.5 * (min(value, held) + logdet)
+                    said[h] = -0.5 * (min(value, held) + logdet)
                     for j in range(n):
                         before[j] = x[j]
                     absorb(x, P_sqrt, f, two[0], two[2], keep, move)
@@ -1251,12 +1449,25 @@ def run(fil, net, shared, bank, records, epochs, first, out):
                     project(P_sqrt, h_two, f_two)
                     absorb(x, P_sqrt, f_two, innovation, two[3], keep, move)
                 common[C_FIX_TIME], fix_dt = time, time - common[C_FIX_TIME]
+                most = -np.inf
+                for i in range(bank.live[0]):
+                    most = max(most, said[bank.live[1 + i]])
+                fade = math.exp(-fix_dt / k[K_MEMORY])
+                for i in range(bank.live[0]):
+                    h = bank.live[1 + i]
+                    before_fading = bank.info[h, FADING]
+                    bank.info[h, FADING] = fade * before_fading + said[h] - most
+                    bank.logw[h] += bank.info[h, FADING] - before_fading
+                common[C_JUMPS] *= math.exp(-fix_dt / 30.0)
+                if step > 0.0:
+                    common[C_JUMPS] += 1.0
             normalise(bank, shared.weight, k[K_PRUNE], int(k[K_MOST]))
             if accepted:
                 if common[C_FRESH] == 0.0:
-                    adapt(fil, shared, bank, row, point, min(fix_dt, 10.0), f, column)
+                    adapt(fil, shared, bank, time, point, min(fix_dt, 10.0), f, column, keep, move)
                     normalise(bank, shared.weight, k[K_PRUNE], int(k[K_MOST]))
-            elif time - common[C_SUSPECT_SINCE] > k[K_LOST_AFTER]:
+            if common[C_JUMPS] > 4.0 or (not accepted and time - common[C_SUSPECT_SINCE] > k[K_LOST_AFTER]):
+                common[C_JUMPS] = 0.0
                 bank.used[:] = 0
                 bank.live[0] = 0
                 common[C_SUSPECTS] = 0.0

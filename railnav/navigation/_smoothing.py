@@ -13,8 +13,10 @@ from railnav.navigation._kernels import (
     R_PARENT,
     R_PULL,
     R_SHAKE,
+    R_SIGN,
     R_SLIP,
     R_STEP,
+    R_TAG,
     R_VERSION,
     SPEED,
     TIME,
@@ -50,8 +52,8 @@ def smooth_lineage(fil, records, epochs, chain, first, last, x, sigma):
     n = x.shape[1]
     i_s, i_v = fil.at[POSITION], fil.at[SPEED]
     F = np.empty((n, n))
-    Q = np.empty((14, n))
-    lead = np.empty(14, np.int64)
+    Q = np.empty((16, n))
+    lead = np.empty(16, np.int64)
     new = np.empty(n)
     gain = np.empty((n, n))
     state = records.x[chain[last]].copy()
@@ -71,11 +73,13 @@ def smooth_lineage(fil, records, epochs, chain, first, last, x, sigma):
                 fil,
                 state,
                 dt,
+                numbers[R_SIGN],
                 epochs[e + 1, FORCE],
                 numbers[R_PULL],
                 numbers[R_SLIP],
                 numbers[R_SHAKE],
                 numbers[R_STEP],
+                numbers[R_TAG],
                 F,
                 Q,
                 lead,

@@ -121,6 +121,8 @@ class Navigator:
         Whether epochs bring `forward_force` and `yaw_rate`.
     odometer : str
         What epochs bring of an odometer: "distance", "speed" or "" (nothing).
+    speed : bool
+        Whether the receiver gives a speed.
     signed_odometer : bool
         Whether backing up subtracts from the distance.
     lever_arm_b : (3,) array
@@ -147,6 +149,7 @@ class Navigator:
         *,
         imu: bool = True,
         odometer: str = "distance",
+        speed: bool = True,
         signed_odometer: bool = False,
         lever_arm_b: ArrayLike = (0.0, 0.0, 0.0),
         integrity_risk: float = 1e-4,
@@ -159,7 +162,7 @@ class Navigator:
         self._model = model
         self._settings = _settings_for(model, settings or Settings())
         self._network = pack_network(model)
-        at = layout(imu=imu, odometer=odometer)
+        at = layout(imu=imu, odometer=odometer, speed=speed)
         n = int(at.max()) + 1
         lever = np.array(lever_arm_b, np.float64).reshape(3)
         self._filter = kernel.Filter(
@@ -187,7 +190,7 @@ class Navigator:
             [kernel.C_TIME, kernel.C_FIX_TIME, kernel.C_TRY, kernel.C_WHEEL_SEEN, kernel.C_GNSS_SPEED_TIME]
         ] = -np.inf
         common[[kernel.C_WHEEL_MOVED, kernel.C_GNSS_STILL]] = np.inf
-        common[kernel.C_SCALE] = 1.0
+        common[kernel.C_SCALE] = self._settings.scale_start
         common[kernel.C_OUT_TRACK] = -1.0
         ring = np.column_stack([np.full(kernel.RING, -np.inf), np.full(kernel.RING, np.nan)])
         self._shared = kernel.Shared(common, ring, np.zeros(SLOTS))
@@ -300,7 +303,12 @@ class Navigator:
         from railnav.matching.candidates import starting_candidates
 
         found = starting_candidates(
-            self._model, network, float(row[kernel.EAST]), float(row[kernel.NORTH]), within=within
+            self._model,
+            network,
+            float(row[kernel.EAST]),
+            float(row[kernel.NORTH]),
+            within=within,
+            overhang=2.0 * sigma + 5.0,
         )
         common[kernel.C_NOTHING_NEAR] = float(not found)
         if not found:
@@ -308,6 +316,7 @@ class Navigator:
         frame = math.hypot(settings.gnss_frame_share * sigma, settings.model_sigma)
         frame = min(max(frame, settings.frame_sigma_least), settings.frame_sigma_most)
         common[kernel.C_FRAME_SIGMA] = max(frame, common[kernel.C_FRAME_SIGMA])
+        common[kernel.C_FRAME_TIME] = time + 60.0
         common[kernel.C_FRESH] = 1.0
         common[kernel.C_STARTED] = 1.0
         common[kernel.C_STARTS] += 1.0
@@ -320,6 +329,8 @@ class Navigator:
         scale = math.sqrt(common[kernel.C_SCALE] ** 2 + settings.gnss_white_share**2)
         sd = np.ones(len(State))
         sd[[State.FRAME_EAST, State.FRAME_NORTH]] = common[kernel.C_FRAME_SIGMA]
+        sd[State.TIME_TAG] = settings.time_tag_sigma
+        sd[State.SPEED_LATENCY] = settings.speed_latency
         sd[State.ODOMETER_SCALE] = settings.odometer_scale
         sd[State.GYRO_BIAS] = settings.gyro_bias
         sd[State.ACCELEROMETER_BIAS] = settings.accelerometer_bias
@@ -354,7 +365,9 @@ class Navigator:
                 bank.tags[h, paths.RECORD] = -1
                 bank.tags[h, paths.VERSION] = -1
                 bank.tags[h, paths.MOVED] = int(moved)
+                bank.tags[h, paths.SIGN] = 1 if v >= 0.0 else -1
                 bank.info[h] = -np.inf
+                bank.info[h, paths.FADING] = 0.0
 
     def _directions(
         self, row: FloatArray, point: FloatArray, speed: float, sigma_speed: float
@@ -477,10 +490,11 @@ def navigate(
         model,
         imu=imu is not None and len(imu) > 0,
         odometer=kind,
+        speed=gnss.speed is not None,
         signed_odometer=odometer is not None and odometer.signed,
         lever_arm_b=gnss.lever_arm_b,
         integrity_risk=integrity_risk,
-        settings=settings,
+        settings=settings or Settings.of_receiver(gnss.receiver),
     )
     m = len(table)
     if smooth:
