@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from railnav.errors import EstimationError
 from railnav.estimation import _kernels
-from railnav.estimation.chain import Chain, as_floats, compiled_size, prior_rows, start_triangle, sweep_chain
+from railnav.estimation.chain import Chain, Sweep, as_floats, compiled_size, prior_rows, start_triangle, sweep_chain
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -147,8 +147,8 @@ class ChainFilter:
         EstimationError
             Shapes do not fit, a value is not finite, or the rows couple nothing.
         """
-        self._epoch = max(self._epoch, 0)
-        self.sweep(np.zeros((0, self.n)), np.zeros((1, 0)), M, L, np.atleast_2d(as_floats("u", u)))
+        rows = np.atleast_2d(as_floats("u", u))
+        self._take(Chain(np.zeros((0, self.n)), np.zeros((1, 0)), M, L, rows, lead=1))
 
     def observe(self, H: ArrayLike, z: ArrayLike, *, log_det_whitening: float = 0.0) -> BlockResult:
         """Let observation rows H x = z of the current epoch in.
@@ -177,11 +177,10 @@ class ChainFilter:
         Specification rail 15.4.
         """
         stretch = Chain(H, np.atleast_2d(as_floats("z", z)))
-        self._check(stretch)
         before = np.diagonal(self._triangle).copy()
-        result = sweep_chain(stretch, self._triangle, store=False, filtered=False, gate=None)
-        self._finite(stretch)
-        self._epoch = max(self._epoch, 0)
+        epoch = max(self._epoch, 0)
+        result = self._take(stretch)
+        self._epoch = epoch
         evidence = None
         nis, dof = float(result.nis[0]), int(result.dof[0])
         if (before > 0).all():
@@ -231,16 +230,7 @@ class ChainFilter:
         """
         lead = 1 if self._epoch >= 0 else 0
         stretch = Chain(H, z, M, L, u, counts=counts, coupling_counts=coupling_counts, lead=lead)
-        self._check(stretch)
-        lag = self._records.maxlen or 0
-        result = sweep_chain(stretch, self._triangle, store=lag > 0, filtered=filtered, gate=gate)
-        self._finite(stretch)
-        if result.broken >= 0:
-            raise EstimationError(
-                f"the link from epoch {max(self._epoch, 0) + result.broken} couples nothing; start a new filter there"
-            )
-        self._epoch += len(stretch)
-        self._records.extend(result.records[-lag:].copy() if lag else ())
+        result = self._take(stretch, gate=gate, filtered=filtered)
         return SweepResult(
             result.nis,
             result.dof,
@@ -302,10 +292,21 @@ class ChainFilter:
         _kernels.covariance_chain_kernel(compiled_size(n))(records, self._triangle, P, np.empty((0, n, n)))
         return FilterEstimate(self._epoch - lag, state[0], P[0])
 
-    def _check(self, stretch: Chain) -> None:
+    def _take(self, stretch: Chain, *, gate: float | None = None, filtered: bool = False) -> Sweep:
+        """Sweep a stretch; if that fails, the filter is as it was."""
         if stretch.n != self.n:
             raise EstimationError(f"the rows have {stretch.n} coefficients; the filter's states have {self.n}")
-
-    def _finite(self, stretch: Chain) -> None:
-        if not np.isfinite(self._triangle).all():
+        lag = self._records.maxlen or 0
+        triangle = self._triangle.copy()
+        result = sweep_chain(stretch, triangle, store=lag > 0, filtered=filtered, gate=gate)
+        if not np.isfinite(triangle).all():
             raise EstimationError(stretch.blame())
+        first = max(self._epoch, 0)
+        if result.broken >= 0:
+            raise EstimationError(
+                f"the link from epoch {first + result.broken} couples nothing; start a new filter there"
+            )
+        self._triangle = triangle
+        self._epoch = (first if stretch.lead else self._epoch) + len(stretch)
+        self._records.extend(result.records[-lag:].copy() if lag else ())
+        return result

@@ -349,6 +349,25 @@ def test_filter_row_by_row_and_in_stretches_is_the_chain(n: int) -> None:
             filtering.lagged(8)
 
 
+def test_a_refused_row_leaves_the_filter_as_it_was() -> None:
+    live = ChainFilter(2, prior=(np.eye(2), np.zeros(2)), lag=3)
+    live.observe(np.eye(2), [1.0, 2.0])
+    live.couple(-np.eye(2), np.eye(2), [1.0, 1.0])
+    before = live.triangle
+    for wrong, message in (
+        (lambda: live.observe(np.eye(2), [np.nan, 0.0]), "z is not finite at epoch 0, row 0"),
+        (lambda: live.couple(-np.eye(2), np.eye(2), [0.0, np.inf]), "u is not finite at coupling 0, row 1"),
+        (lambda: live.couple(np.zeros((2, 2)), np.eye(2), [0.0, 0.0]), "link from epoch 1 couples nothing"),
+        (lambda: live.observe(np.eye(3), np.zeros(3)), "3 coefficients; the filter's states have 2"),
+        (lambda: ChainFilter(0), "makes no sense"),
+    ):
+        with pytest.raises(EstimationError, match=message):
+            wrong()
+        np.testing.assert_array_equal(live.triangle, before)
+        assert live.epoch == 1
+    np.testing.assert_allclose(live.lagged(1).state, [0.5, 1.0], rtol=0, atol=1e-14)
+
+
 def test_evidence_is_the_normal_density_of_the_innovation() -> None:
     from scipy.stats import multivariate_normal
 
