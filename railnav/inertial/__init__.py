@@ -66,6 +66,16 @@ from railnav.inertial.diagnosis import (
     diagnose,
     scalar_control,
 )
+from railnav.inertial.error_model import (
+    ErrorState,
+    error_dynamics,
+    error_transition,
+    feed_back,
+    gnss_design,
+    position_scale,
+    process_noise_sqrt,
+    vehicle_design,
+)
 from railnav.inertial.mechanization import (
     EARTH_RATE,
     GravityField,
@@ -82,6 +92,7 @@ __all__ = [
     "Alignment",
     "AllanCurve",
     "Diagnosis",
+    "ErrorState",
     "FineAlignment",
     "FixedLatitude",
     "GravityField",
@@ -108,6 +119,9 @@ __all__ = [
     "compass_heading",
     "coning_rate",
     "diagnose",
+    "error_dynamics",
+    "error_transition",
+    "feed_back",
     "fine_align",
     "finite_rotation",
     "fit_allan",
@@ -115,6 +129,7 @@ __all__ = [
     "fixed_latitude",
     "fixed_latitude_error",
     "geodetic_minus_geocentric",
+    "gnss_design",
     "great_circle_heading",
     "great_circle_heading_error",
     "ground_speed",
@@ -131,6 +146,8 @@ __all__ = [
     "moving_position",
     "multi_position",
     "position_mean",
+    "position_scale",
+    "process_noise_sqrt",
     "required_grade",
     "rest",
     "scalar_control",
@@ -140,4 +157,5 @@ __all__ = [
     "turned_force",
     "turned_rate",
     "vector_calibration",
+    "vehicle_design",
 ]
