@@ -155,26 +155,44 @@ def main(arguments: list[str] | None = None) -> int:
         return 1
     print(
         f"build of {figures['runs']} runs, {figures['fixes']:,} fixes, {figures['length_m'] / 1000:.1f} km of track: "
-        f"{figures['seconds']:.1f} s, {figures['peak_rss_gb']:.2f} GB"
+        f"{figures['seconds']:.1f} s, {figures['peak_rss_gb']:.2f} GB (bars: 60 s, 2 GB)"
     )
-    for name in ("one_run_left_out", "whole_train_left_out", "not_in_the_build"):
+    for track in figures["tracks"]:
+        print(
+            f"  track {track['track']}: {track['length_m']:.1f} m, sigma across {track['sigma_cross_m']:.2f} m (median)"
+        )
+    for kind in figures["receivers"]:
+        print(
+            f"  receiver {kind['receiver']}: frame offset {kind['offset_east_m']:+.2f} m east, {kind['offset_north_m']:+.2f} m north "
+            f"of the datum, sigma {kind['sigma_east_m']:.2f} and {kind['sigma_north_m']:.2f} m, {kind['runs']} runs"
+        )
+    titles = {
+        "one_run_left_out": "one run left out",
+        "whole_train_left_out": "all runs of that train left out",
+        "not_in_the_build": "a receiver that is not in the build (all 16 runs are)",
+    }
+    for name, title in titles.items():
         rows = figures.get(name)
         if not rows:
             continue
-        print(f"\n{name.replace('_', ' ')}: sigma across, m (1.4826 MAD)")
-        head = f"{'run':28}{'recorded':>10}{'nearest':>10}{'receiver':>10}{'own':>10}{'baseline':>10}"
-        print(f"{head}\n{'':28}{'':10}{'track':>10}{'offset':>10}{'offset':>10}")
+        print(f"\n{title}: 1.4826 MAD of a run's distances across the track it did not help to make, m")
+        print(f"{'':28}{'own track of its direction':>40}{'nearest':>10}{'baseline':>10}")
+        print(f"{'run':28}{'as recorded':>12}{'receiver off.':>14}{'own offset':>14}{'track':>10}{'nearest':>10}")
         lines = [(r["run"], r) for r in rows] + [
             (f"mean of {k}", {**v, "receiver": k}) for k, v in summary(rows).items()
         ]
         for label, r in lines:
             numbers = [
                 r["as_recorded_m"],
-                r["nearest_track_m"],
                 r["receiver_offset_removed_m"],
                 r["own_offset_removed_m"],
+                r["nearest_track_m"],
             ]
-            cells = "".join(f"{'' if v is None or not np.isfinite(v) else f'{v:.2f}':>10}" for v in numbers)
+            widths = (12, 14, 14, 10)
+            cells = "".join(
+                f"{'' if v is None or not np.isfinite(v) else f'{v:.2f}':>{w}}"
+                for v, w in zip(numbers, widths, strict=True)
+            )
             print(f"{label:28}{cells}{BASELINE.get(r['receiver'], float('nan')):>10.1f}")
     if options.json is not None:
         options.json.write_text(json.dumps(figures, indent=1), encoding="utf-8")

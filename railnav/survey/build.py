@@ -99,8 +99,8 @@ def build(
 
     Notes
     -----
-    What all runs of a track have in common shows in no difference: the datum is the equally weighted mean of the kinds of receiver
-    (by majority where there are three or more), and its uncertainty is stated beside the model, not in the knots. Tracks
+    What all runs of a track have in common shows in no difference: the datum is a weighted mean of the kinds of receiver (two that
+    differ count the same, of three the majority counts), and its uncertainty is stated beside the model, not in the knots. Tracks
     shorter than a few hundred metres, loops that touch themselves and lines that branch are not resolved: each run belongs to
     one track along its whole way, apart from stretches set aside.
 

@@ -26,7 +26,7 @@ REASONS = (
     "far from the line",
     "gross error across the track",
     "on another track here",
-    "alone where no other run is, beyond the end of the track",
+    "beyond the end of the track",
 )
 USED, STATED_SIGMA, JUMP, FAR, GROSS, OTHER_TRACK, BEYOND = range(len(REASONS))
 

@@ -1,8 +1,9 @@
 """Frame offsets: how far each run's positions stand from the others, and the datum that this leaves open.
 
 On a line with bends, distances across the track show both components of the offset between two runs. What all runs have in common
-no run can show; the datum is a choice, and it is made in one place: the offsets of the kinds of receiver add up to nothing
-(weighted equally, or by majority where three or more kinds are there), and each run's own offset lies about its receiver's.
+no run can show; the datum is a choice, and it is made in one place: the weighted offsets of the kinds of receiver add up to
+nothing (weights in `_datum_weights`: two kinds that differ count the same, of three or more the majority counts), and each run's
+own offset lies about its receiver's.
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
-#: Receivers whose offsets differ from the majority's by more than this carry less weight in the datum, m.
-MAJORITY = 2.0
+#: A kind of receiver farther than this from the datum has no more influence on it than one at this distance, m.
+MAJORITY = 1.0
 #: Prior of a receiver's own offset, m: none to speak of.
 RECEIVER_PRIOR = 1e3
 #: Draws an offset that a straight line does not show to nothing.
@@ -141,10 +143,9 @@ def settle(knowledge: Sequence[Knowledge], kind: IntArray, scale: FloatArray, co
                 square = (theta[r] - receiver[c]) ** 2 + P[i, i] + P[j, j] - 2 * P[i, j]
                 power += float(square.mean())
             scatter[c] = np.sqrt(power / (SCATTER_DOF + len(members)))
-        if heard.sum() >= 3:
-            distance = np.hypot(*receiver.T) if B == 2 else np.abs(receiver[:, 0])
-            pull = np.where(heard, np.minimum(1.0, MAJORITY / np.maximum(distance, 1e-9)) ** 2, 0.0)
-            weight = pull / pull.sum()
+        weight = _datum_weights(
+            receiver, scatter / np.sqrt(np.maximum(np.bincount(kind, minlength=C), 1)), weight, heard
+        )
     return Offsets(
         run=x[: R * B].reshape(R, B),
         receiver=x[R * B :].reshape(C, B),
@@ -153,6 +154,25 @@ def settle(knowledge: Sequence[Knowledge], kind: IntArray, scale: FloatArray, co
         scatter=scatter,
         weight=weight,
     )
+
+
+def _datum_weights(receiver: FloatArray, sigma: FloatArray, weight: FloatArray, heard: BoolArray) -> FloatArray:
+    """Weights of the kinds of receiver in the datum, sum 1 (one step; `receiver` stands about the present weighted mean).
+
+    A kind weighs by how well its own offset is known, beside how far kinds differ anyway (as in a meta-analysis with random
+    effects); with three kinds or more the influence of one that stands apart is bounded (Huber).
+    """
+    offset, own = receiver[heard], sigma[heard]
+    if len(offset) < 2:
+        return weight
+    apart = np.linalg.norm(offset - np.median(offset, axis=0), axis=1)
+    between = np.sqrt(2.0) * float(apart.max()) if len(offset) == 2 else 1.4826 * float(np.median(apart))
+    pull = 1.0 / (between**2 + own**2)
+    if len(offset) >= 3:
+        pull *= np.minimum(1.0, MAJORITY / np.maximum(np.linalg.norm(offset, axis=1), 1e-9))
+    out = np.zeros(len(weight))
+    out[heard] = pull / pull.sum()
+    return out
 
 
 def differences(value: FloatArray, design: FloatArray, runs: Sequence[int]) -> Knowledge:

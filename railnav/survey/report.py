@@ -337,9 +337,9 @@ def _datum(survey: Survey, offsets: Offsets) -> dict[str, Any]:
             "sigma_east_m": _number(own),
             "sigma_north_m": _number(own),
         }
-    how = "weighted by majority" if len(names) >= 3 else "each kind counts the same"
+    shares = ", ".join(f"{name} {100 * w:.0f} %" for name, w in zip(names, offsets.weight, strict=True))
     return {
-        "rule": f"mean of the kinds of receiver ({', '.join(names)}), {how}; which of them is right cannot be seen",
+        "rule": f"weighted mean of the kinds of receiver ({shares}); which of them is right cannot be seen",
         "observable": True,
         "sigma_east_m": _number(sigma[0]),
         "sigma_north_m": _number(sigma[1]),

@@ -105,9 +105,9 @@ def test_an_offset_between_receivers_is_found_and_reported():
     assert abs(east + 2.4) < 3 * sigma_e < 6.0
     assert abs(north + 9.8) < 3 * sigma_n < 6.0
     # the datum lies between the two, and is known no better than they agree
-    assert kinds["logger"]["offset_north_m"] == pytest.approx(-kinds["phone"]["offset_north_m"], abs=1e-3)
+    assert kinds["logger"]["offset_north_m"] == pytest.approx(-kinds["phone"]["offset_north_m"], abs=0.05)
     assert report(model)["datum"]["observable"]
-    assert report(model)["datum"]["sigma_north_m"] == pytest.approx(0.5 * abs(north), abs=0.01)
+    assert report(model)["datum"]["sigma_north_m"] == pytest.approx(0.5 * abs(north), abs=0.05)
     assert any("difference of frames" in w and "m north" in w for w in report(model)["warnings"])
 
 
