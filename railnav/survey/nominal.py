@@ -9,13 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railnav.survey import _kernels
-from railnav.survey.fixes import JUMP, STATED_SIGMA, USED, Fixes
+from railnav.survey.fixes import JUMP, STATED_SIGMA, TURNED, USED, Fixes
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 #: A run's course is thinned to points this far apart, m.
 THINNING = 30.0
+#: A run turns back when this much of its way lies along itself, m.
+TURNING_BACK = 200.0
 #: Two courses closer than this run alongside, m.
 ALONGSIDE = 80.0
 #: Share of a run's course that must lie on a line for the run to belong to it.
@@ -118,22 +120,50 @@ def curve(easting: FloatArray, northing: FloatArray, step: float) -> Nominal:
 
 
 def course(fixes: Fixes) -> FloatArray:
-    """Points of a run about 30 m apart, (k, 2), without the wandering at stops and without folds."""
-    used = fixes.reason == USED
+    """Points of a run about 30 m apart, (k, 2), without the wandering at stops and without folds.
+
+    Of a run that turns back the longest way in one sense is taken; the fixes of the others are set aside.
+    """
+    used = np.flatnonzero(fixes.reason == USED)
     x, y = fixes.easting[used], fixes.northing[used]
     keep = _kernels.thin(x, y, THINNING)
     if len(x) and np.hypot(x[-1] - x[keep][-1], y[-1] - y[keep][-1]) > 0.2 * THINNING:
         keep[-1] = True
-    points = np.column_stack([x[keep], y[keep]])
+    at = used[keep]
     for _ in range(5):
-        if len(points) < 3:
+        step = np.diff(np.column_stack([fixes.easting[at], fixes.northing[at]]), axis=0)
+        fold = (step[1:] * step[:-1]).sum(axis=1) < 0.0
+        if len(at) < 3 or not fold.any():
             break
-        a, b = np.diff(points[:-1], axis=0), np.diff(points[1:], axis=0)
-        fold = (a * b).sum(axis=1) < 0.0
-        if not fold.any():
-            break
-        points = points[np.concatenate([[True], ~fold, [True]])]
-    return points
+        at = at[np.concatenate([[True], ~fold, [True]])]
+    points = np.column_stack([fixes.easting[at], fixes.northing[at]])
+    first, last = _one_way(points)
+    if first > 0 or last < len(points):
+        aside = np.ones(len(fixes), np.bool_)
+        aside[at[first] : at[last - 1] + 1] = False
+        fixes.reason[aside & (fixes.reason == USED)] = TURNED
+    return points[first:last]
+
+
+def _one_way(points: FloatArray) -> tuple[int, int]:
+    """Longest stretch (from, to) of a course that does not come back along itself; all of it when less than 200 m does."""
+    from scipy.spatial import cKDTree
+
+    if len(points) < 10:
+        return 0, len(points)
+    direction = np.gradient(points, axis=0)
+    direction /= np.maximum(np.hypot(*direction.T), 1e-9)[:, None]
+    back = np.zeros(len(points), np.bool_)
+    pairs = cKDTree(points).query_pairs(1.5 * THINNING, output_type="ndarray")
+    against = (direction[pairs[:, 0]] * direction[pairs[:, 1]]).sum(axis=1) < -0.5
+    back[pairs[against].max(axis=1)] = True
+    if np.count_nonzero(back) * THINNING < TURNING_BACK:
+        return 0, len(points)
+    # a change of sense within a few points is noise
+    back = np.convolve(back, np.ones(5), mode="same") > 2.5
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(back.astype(np.int8))) + 1, [len(points)]])
+    longest = int(np.argmax(np.diff(edges)))
+    return int(edges[longest]), int(edges[longest + 1])
 
 
 @dataclass(slots=True, eq=False)
@@ -246,7 +276,7 @@ def smooth_course(points: FloatArray, step: float, width: float) -> Nominal:
 def along(nominal: Nominal, fixes: Fixes, limit: float) -> tuple[FloatArray, FloatArray]:
     """Where each fix of a run lies: offset on the nominal curve, m, and distance to its right, m; NaN farther than `limit`."""
     s, d = np.full(len(fixes), np.nan), np.full(len(fixes), np.nan)
-    sound = np.flatnonzero((fixes.reason != STATED_SIGMA) & (fixes.reason != JUMP))
+    sound = np.flatnonzero(~np.isin(fixes.reason, (STATED_SIGMA, JUMP, TURNED)))
     at, right = np.empty(len(sound)), np.empty(len(sound))
     _kernels.walk(
         nominal.easting,

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railnav.survey.axis import ErrorModel
-from railnav.survey.fixes import BEYOND, FAR, OTHER_TRACK, REASONS, USED, Fixes
+from railnav.survey.fixes import BEYOND, FAR, OTHER_TRACK, REASONS, TURNED, USED, Fixes
 from railnav.survey.offsets import Offsets
 from railnav.survey.surveyed import Surveyed
 from railnav.survey.vertical import Heights
@@ -434,6 +434,10 @@ def _warnings(
             out.append(
                 f"run {entry['id']} lies {far[0]:.1f}{f' to {far[-1]:.1f}' if len(far) > 1 else ''} m beside track "
                 f"{aside[0]['track']} at offsets {where} m: on another track there, or wrong; not used there"
+            )
+        if REASONS[TURNED] in entry["fixes"]["rejected"]:
+            out.append(
+                f"run {entry['id']} turns back; only its longest way in one sense is used: make a run of each way"
             )
         fixes = entry["fixes"]
         if entry["tracks"] and fixes["used"] < 0.5 * fixes["total"]:

@@ -390,6 +390,31 @@ def test_the_order_of_runs_changes_nothing_but_the_order():
         assert np.abs(one.easting[a] - two.easting[b]).max() < 2e-3
 
 
+def test_a_run_that_turns_back_is_cut_and_said_so():
+    runs, axis, frame, rng = single_line(27, km=3.0)
+    there = drive(axis, frame, rng, run_id="both", direction="up", begin=0.1, end=0.9)
+    back = drive(axis.shifted(-4.0), frame, rng, run_id="back", backwards=True, begin=0.4, end=0.9)
+    join = {
+        name: np.concatenate([getattr(there.gnss, name), getattr(back.gnss, name)])
+        for name in ("latitude", "longitude", "height", "sigma_east", "sigma_north")
+    }
+    time = np.concatenate([there.gnss.time, there.gnss.time[-1] + 60.0 + back.gnss.time])
+    model = build([changed(there, time=time, **join), *runs])
+    assert model.track_id == ("up",)
+    assert rms(model, "up", axis) < 0.015
+    aside = entry(model, "both")["fixes"]["rejected"]["before or after turning back"]
+    assert aside["count"] == pytest.approx(len(back.gnss), rel=0.1)
+    assert any("both turns back" in w for w in report(model)["warnings"])
+
+
+def test_a_track_of_three_hundred_metres():
+    runs, axis, _, _ = single_line(28, km=0.1)
+    keep = [only(run, slice(0, 60)) for run in runs]
+    model = build(keep)
+    assert 200.0 < model.length("up") < 350.0
+    assert rms(model, "up", axis) < 0.03
+
+
 def test_a_lever_arm_leans_with_the_cant():
     from dataclasses import replace
 
