@@ -6,6 +6,7 @@ rotates; no normal equations, no difference of covariances.
 - **Chain.** `Chain` holds the rows of a block-bidiagonal Gauss-Markov model, `solve_chain` gives all states with their
   covariances, NIS and residual statistics, `ChainFilter` takes the same rows live in constant memory. `increment_chain` and
   `constant_velocity_chain` make the rows of the usual states.
+- **Groups.** `group_least_squares` finds unknowns group by group, by projections kept as orthonormal bases.
 - **Covariance roots.** `predict`, `update`, `smooth` on P_sqrt (lower triangular, positive diagonal, P = P_sqrt P_sqrt^T);
   `inverse_root` whitens, `lower_root` takes roots, `repair_covariance` mends rounding. Compiled loops elsewhere call
   `predict_kernel`, `innovation_variance_kernel`, `update_scalar_kernel`, `update_kernel` and `smooth_kernel` of
@@ -31,6 +32,7 @@ from railnav.estimation.gross_error import (
     geometric_test,
     geometric_tolerance,
 )
+from railnav.estimation.groups import GroupSolution, group_least_squares
 from railnav.estimation.menus import constant_velocity_chain, increment_chain
 from railnav.estimation.square_root import (
     RepairedCovariance,
@@ -54,6 +56,7 @@ __all__ = [
     "Coverage",
     "FilterEstimate",
     "GeometricTest",
+    "GroupSolution",
     "RepairedCovariance",
     "Smoothed",
     "SweepResult",
@@ -66,6 +69,7 @@ __all__ = [
     "coverage",
     "geometric_test",
     "geometric_tolerance",
+    "group_least_squares",
     "increment_chain",
     "inverse_root",
     "lower_root",
