@@ -20,9 +20,9 @@ def multiply(a0, a1, a2, a3, b0, b1, b2, b3):
 
 @njit(cache=True)
 def exponential(x, y, z):  # rad
-    """Quaternion of a rotation vector; a series below 0.1 rad, exact to the last place."""
+    """Quaternion of a rotation vector; a series below 0.2 rad, exact to the last place."""
     square = 0.25 * (x * x + y * y + z * z)  # of the half angle
-    if square < 0.0025:
+    if square < 0.01:
         cosine = 1.0 - square * (1.0 / 2.0 - square * (1.0 / 24.0 - square * (1.0 / 720.0 - square / 40320.0)))
         factor = 0.5 - square * (1.0 / 12.0 - square * (1.0 / 240.0 - square * (1.0 / 10080.0 - square / 725760.0)))
     else:

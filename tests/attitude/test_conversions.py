@@ -73,6 +73,18 @@ def test_half_a_turn(gap):
         np.testing.assert_allclose(back, v, atol=3e-15)
 
 
+def test_exactly_half_a_turn_takes_the_positive_axis():
+    for axis in range(3):
+        q = np.zeros(4)
+        q[1 + axis] = -1.0
+        expected = np.pi * np.eye(3)[axis]
+        np.testing.assert_array_equal(at.rotation_vector_from_quaternion(q), expected)
+        np.testing.assert_array_equal(at.rotation_vector_from_dcm(2 * np.diag(np.eye(3)[axis]) - np.eye(3)), expected)
+    np.testing.assert_array_equal(
+        at.rotation_vector_from_quaternion([0, 0, -0.6, 0.8]), np.pi * np.array([0, 0.6, -0.8])
+    )
+
+
 def test_euler_angles_come_back_everywhere():
     C = random_rotations()
     np.testing.assert_allclose(at.dcm_from_euler(*at.euler_from_dcm(C)), C, atol=2e-15)

@@ -197,6 +197,13 @@ def test_propagate_keeps_unit_length_and_equals_the_product():
     np.testing.assert_allclose(big, at.dcm_from_rotation_vector([0, 0, 3.0]), atol=1e-15)
 
 
+@pytest.mark.parametrize("size", [0.0, 1e-9, 0.05, 0.19, 0.199999, 0.200001, 1.0, 6.0])
+def test_one_step_is_exact_on_both_sides_of_the_series(size):
+    phi = size * np.array([0.6, -0.64, 0.48])
+    got = at.propagate([1.0, 0, 0, 0], [phi])[1]
+    np.testing.assert_allclose(got, at.quaternion_from_rotation_vector(phi), atol=2.3e-16)
+
+
 def test_a_fixed_axis_needs_no_correction():
     axis = np.array([0.6, -0.64, 0.48])
     for n in (1, 2, 3, 4):

@@ -261,6 +261,23 @@ def test_sigmas_of_vector_calibration_are_honest():
     assert np.sqrt(np.mean(np.square(residual))) == pytest.approx(0.02, rel=0.05)
 
 
+def test_covariance_of_a_very_skew_triad_is_propagated():
+    response = np.array([[1.1, 0.5, -0.3], [0.0, 0.9, 0.4], [0.2, -0.6, 1.3]])
+    k = np.arange(12) * 30 * DEGREE
+    force = turned_force(2 * k, 4 * k, k)
+    clean = force @ response.T + BIAS
+    stated = vector_calibration(clean, force, sigma=1e-5).covariance
+    base = vector_calibration(clean, force)
+    covariance = np.zeros((12, 12))  # by perturbing every reading
+    for place in np.ndindex(clean.shape):
+        moved = clean.copy()
+        moved[place] += 1e-5
+        got = vector_calibration(moved, force)
+        change = np.concatenate([got.bias - base.bias, (got.matrix - base.matrix).ravel()])
+        covariance += np.outer(change, change)
+    np.testing.assert_allclose(stated, covariance, rtol=1e-3, atol=1e-3 * np.abs(covariance).max())
+
+
 # --- advice, rest, temperature ------------------------------------------------------------------------------------------------
 
 
