@@ -76,6 +76,7 @@ from railnav.inertial.error_model import (
     process_noise_sqrt,
     vehicle_design,
 )
+from railnav.inertial.inspection import Finding, inspect_log
 from railnav.inertial.mechanization import (
     EARTH_RATE,
     GravityField,
@@ -93,6 +94,7 @@ __all__ = [
     "AllanCurve",
     "Diagnosis",
     "ErrorState",
+    "Finding",
     "FineAlignment",
     "FixedLatitude",
     "GravityField",
@@ -138,6 +140,7 @@ __all__ = [
     "gyrocompass_error",
     "heading_from_antennas",
     "heading_from_velocity",
+    "inspect_log",
     "level",
     "lever_arm_motion",
     "longitude_from_reference",
