@@ -1,5 +1,5 @@
 """Survey runs become a reference track model."""
 
-from railnav.survey.build import build
+from railnav.survey.construction import build
 
 __all__ = ["build"]
