@@ -395,8 +395,10 @@ def test_the_demo_and_every_example_of_the_help(tmp_path: Path, monkeypatch: pyt
     page = (tmp_path / "demo" / "report.html").read_text(encoding="utf-8")
     assert "Simulated data" in page
     assert len(page.encode()) < 8e6
-    facts = run_json("demo", "--seed", "2")
+    facts = run_json("demo")
     assert facts["simulated"]
-    assert facts["evaluation"]["selection"]["rate"] == 1.0
+    assert facts["evaluation"]["selection"]["rate"] > 0.95
+    assert facts["evaluation"]["jumps"]["illegal"] == []
+    assert facts["model"]["axis_rms_m"] < 0.01
     assert facts["wall_s"] < 600.0
     shutil.rmtree(tmp_path / "demo")
