@@ -25,6 +25,9 @@ BoolArray = NDArray[np.bool_]
 #: A visit of a track further away in time than this is another visit, s.
 VISIT_WINDOW = 120.0
 
+#: A solution that never comes nearer to the truth than this is of another run, m.
+ANOTHER_RUN = 10_000.0
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Visits:
@@ -201,7 +204,8 @@ def compare(
     Raises
     ------
     InputError
-        An empty solution or truth, no common time, or a `by` that is none of the three.
+        An empty solution or truth, no common time, a solution that is kilometres from the truth all the time, or a `by` that is none
+        of the three.
 
     Notes
     -----
@@ -239,6 +243,12 @@ def compare(
     ahead = north * np.cos(here.heading) + east * np.sin(here.heading)
     across = east * np.cos(here.heading) - north * np.sin(here.heading)
     positioned = (solution.track[row] >= 0) & np.isfinite(solution.offset[row])
+    apart = np.hypot(north, east)[positioned]
+    if len(apart) and apart.min() > ANOTHER_RUN:
+        raise InputError(
+            f"the solution nowhere comes nearer to the truth than {apart.min() / 1000:.1f} km",
+            remedy="evaluate a solution against the truth of the same run",
+        )
     along = np.where(positioned, ahead, np.nan)
     true_track = visits.track[here.visit]
     if by_name:

@@ -193,6 +193,8 @@ def test_all_lost(model, ride):
 
 def test_no_common_time_and_other_refusals(model, ride):
     solution = truth_as_solution(ride, model)
+    with pytest.raises(InputError, match=r"nowhere comes nearer to the truth than 1\d\d\.\d km"):
+        evaluate(replace(solution, latitude=solution.latitude + np.radians(1.0)), ride)
     with pytest.raises(InputError, match="no common time"):
         evaluate(replace(solution, time=solution.time + 1e4), ride)
     with pytest.raises(InputError, match="no rows"):
