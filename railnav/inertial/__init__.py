@@ -1,4 +1,4 @@
-"""Inertial sensors and what can be made of them alone: error models, calibration, alignment, strapdown.
+"""Inertial sensors and what can be made of them alone: error models, calibration, alignment, strapdown, GNSS aiding.
 
 Body axes b are forward, right, down; local axes n are north, east, down. `specific_force_b` is what an accelerometer measures,
 acceleration minus gravitation: at rest it points up with the size of gravity, so its third component is about -9.81 m/s^2 on a
@@ -77,6 +77,7 @@ from railnav.inertial.error_model import (
     vehicle_design,
 )
 from railnav.inertial.inspection import Finding, inspect_log
+from railnav.inertial.loose import ImuNoise, InitialSigma, LooseSolution, integrate_gnss
 from railnav.inertial.mechanization import (
     EARTH_RATE,
     GravityField,
@@ -98,6 +99,9 @@ __all__ = [
     "FineAlignment",
     "FixedLatitude",
     "GravityField",
+    "ImuNoise",
+    "InitialSigma",
+    "LooseSolution",
     "MovingPosition",
     "NavigationState",
     "NoiseParameters",
@@ -141,6 +145,7 @@ __all__ = [
     "heading_from_antennas",
     "heading_from_velocity",
     "inspect_log",
+    "integrate_gnss",
     "level",
     "lever_arm_motion",
     "longitude_from_reference",

@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 
 from railnav.attitude._kernels import exponential, multiply, rotate
+from railnav.estimation._kernels import innovation_variance_kernel, predict_kernel, update_scalar_kernel
 
 #: Elements of a gravity field.
 (
@@ -324,4 +325,181 @@ def strapdown_kernel(scheme, dtheta, dv, interval, field, out):  # (n, 3) rad, (
             out[k + 1, i] = state[i]
         if not abs(state[0]) < POLAR_LATITUDE:
             return k
+    return interval.shape[0]
+
+
+@njit(cache=True)
+def error_transition_kernel(
+    state, force_n, h, field, gyro_time, force_time, Phi
+):  # (10,), (3,) m/s^2, s, ..., (15, 15)
+    """Transition I + F h of the fifteen errors, as `error_model.error_dynamics`; Phi is overwritten."""
+    sine, cosine = math.sin(state[0]), math.cos(state[0])
+    meridian, across = radii(sine, field)
+    a, b = meridian + state[2], across + state[2]
+    vn, ve, vd = state[3], state[4], state[5]
+    t = sine / cosine
+    omega = field[OMEGA]
+    for i in range(15):
+        for j in range(15):
+            Phi[i, j] = 0.0
+        Phi[i, i] = 1.0
+    Phi[0, 2], Phi[0, 3] = -vn / (a * a) * h, h / a
+    Phi[1, 0] = ve * t / (b * cosine) * h
+    Phi[1, 2], Phi[1, 4] = -ve / (b * b * cosine) * h, h / (b * cosine)
+    Phi[2, 5] = -h
+    # rates and their derivatives by latitude (p), height (k) and velocity
+    ien, ied = omega * cosine, -omega * sine
+    wn, we, wd = ve / b, -vn / a, -ve * t / b
+    ienp, iedp = -omega * sine, -omega * cosine
+    wdp = -ve / (b * cosine * cosine)
+    wnk, wek, wdk = -ve / (b * b), vn / (a * a), ve * t / (b * b)
+    # v x (2 dw_ie + dw_en)
+    pn, pd = 2.0 * ienp, 2.0 * iedp + wdp
+    Phi[3, 0], Phi[4, 0], Phi[5, 0] = ve * pd * h, (vd * pn - vn * pd) * h, -ve * pn * h
+    Phi[3, 2] = (ve * wdk - vd * wek) * h
+    Phi[4, 2] = (vd * wnk - vn * wdk) * h
+    gradient = 2.0 * field[EQUATOR] * (1.0 + field[SOMIGLIANA] * sine * sine)
+    gradient /= math.sqrt(1.0 - field[ECCENTRICITY2] * sine * sine) * field[SEMI_MAJOR]
+    Phi[5, 2] = (vn * wek - ve * wnk - gradient) * h
+    # -(2 w_ie + w_en) x dv + v x dw_en(dv); dw_en = (dve/b, -dvn/a, -t dve/b)
+    cn, ce, cd = 2.0 * ien + wn, we, 2.0 * ied + wd
+    Phi[3, 3] += vd / a * h
+    Phi[3, 4] = (cd - ve * t / b) * h
+    Phi[3, 5] = -ce * h
+    Phi[4, 3] = -cd * h
+    Phi[4, 4] += (vd + vn * t) / b * h
+    Phi[4, 5] = cn * h
+    Phi[5, 3] = (ce - vn / a) * h
+    Phi[5, 4] = (-cn - ve / b) * h
+    fn, fe, fd = force_n[0] * h, force_n[1] * h, force_n[2] * h
+    Phi[3, 7], Phi[3, 8] = -fd, fe
+    Phi[4, 6], Phi[4, 8] = fd, -fn
+    Phi[5, 6], Phi[5, 7] = -fe, fn
+    Phi[6, 0], Phi[8, 0] = ienp * h, (iedp + wdp) * h
+    Phi[6, 2], Phi[7, 2], Phi[8, 2] = wnk * h, wek * h, wdk * h
+    Phi[6, 4], Phi[7, 3], Phi[8, 4] = h / b, -h / a, -t / b * h
+    zn, ze, zd = (ien + wn) * h, we * h, (ied + wd) * h
+    Phi[6, 7], Phi[6, 8] = zd, -ze
+    Phi[7, 6], Phi[7, 8] = -zd, zn
+    Phi[8, 6], Phi[8, 7] = ze, -zn
+    q0, q1, q2, q3 = state[6], state[7], state[8], state[9]
+    for j in range(3):
+        x, y, z = rotate(q0, q1, q2, q3, 1.0 if j == 0 else 0.0, 1.0 if j == 1 else 0.0, 1.0 if j == 2 else 0.0)
+        Phi[3, 12 + j], Phi[4, 12 + j], Phi[5, 12 + j] = x * h, y * h, z * h
+        Phi[6, 9 + j], Phi[7, 9 + j], Phi[8, 9 + j] = -x * h, -y * h, -z * h
+        Phi[9 + j, 9 + j] = 1.0 - h / gyro_time
+        Phi[12 + j, 12 + j] = 1.0 - h / force_time
+
+
+@njit(cache=True)
+def loose_kernel(
+    dtheta,
+    dv,
+    interval,
+    field,
+    P_sqrt,
+    densities,
+    times,
+    arm,
+    row,
+    delay,
+    fix,
+    variance,
+    gate,
+    out,
+    bias,
+    sigma,
+    nis,
+    used,
+):
+    # (n, 3) rad, (n, 3) m/s, (n,) s, (11,), (15, 15), (4,), (2,) s, (3,) m; fixes: sample after which (m,), age (m,) s, (m, 6), (m, 6);
+    # out (n + 1, 10), bias (n + 1, 6), sigma (n + 1, 15), nis (m, 6), used (m, 6)
+    """Strapdown with a closed-loop square-root error filter and GNSS fixes; n, or the sample near a pole where it stopped."""
+    state = out[0].copy()
+    memory = np.zeros(13)
+    b = bias[0].copy()
+    Phi = np.empty((15, 15))
+    Q_sqrt = np.zeros((15, 12))
+    x = np.zeros(15)
+    H = np.empty(15)
+    turn, push, force_n, z = np.empty(3), np.empty(3), np.empty(3), np.empty(6)
+    last, root_step, next_fix = -1.0, 0.0, 0
+    for k in range(interval.shape[0]):
+        h = interval[k]
+        for i in range(3):
+            turn[i] = dtheta[k, i] - b[i] * h
+            push[i] = dv[k, i] - b[3 + i] * h
+        q0, q1, q2, q3 = state[6], state[7], state[8], state[9]
+        force_n[0], force_n[1], force_n[2] = rotate(q0, q1, q2, q3, push[0] / h, push[1] / h, push[2] / h)
+        error_transition_kernel(state, force_n, h, field, times[0], times[1], Phi)
+        if h != last:
+            last, root_step = h, math.sqrt(h)
+            for i in range(12):
+                Q_sqrt[3 + i, i] = densities[i // 3] * root_step
+        predict_kernel(P_sqrt, Phi, Q_sqrt)
+        coning_step(state, memory, turn, push, h, field)
+        for i in range(3):
+            b[i] *= 1.0 - h / times[0]
+            b[3 + i] *= 1.0 - h / times[1]
+        if not abs(state[0]) < POLAR_LATITUDE:
+            return k
+        while next_fix < row.shape[0] and row[next_fix] == k:
+            m = next_fix
+            next_fix += 1
+            sine, cosine = math.sin(state[0]), math.cos(state[0])
+            meridian, across = radii(sine, field)
+            north, east = meridian + state[2], (across + state[2]) * cosine
+            q0, q1, q2, q3 = state[6], state[7], state[8], state[9]
+            ln, le, ld = rotate(q0, q1, q2, q3, arm[0], arm[1], arm[2])
+            wx, wy, wz = turn[0] / h, turn[1] / h, turn[2] / h
+            sx, sy, sz = wy * arm[2] - wz * arm[1], wz * arm[0] - wx * arm[2], wx * arm[1] - wy * arm[0]
+            sn, se, sd = rotate(q0, q1, q2, q3, sx, sy, sz)  # of the antenna against the IMU, KZ(2.19)
+            # estimate - fix, the estimate carried back by the age of the fix
+            z[0] = (state[0] - fix[m, 0]) * north + ln - state[3] * delay[m]
+            z[1] = (state[1] - fix[m, 1]) * east + le - state[4] * delay[m]
+            z[2] = (state[2] - fix[m, 2]) - ld + state[5] * delay[m]
+            z[3], z[4], z[5] = state[3] + sn - fix[m, 3], state[4] + se - fix[m, 4], state[5] + sd - fix[m, 5]
+            for i in range(15):
+                x[i] = 0.0
+            for r in range(6):
+                for i in range(15):
+                    H[i] = 0.0
+                if r == 0:
+                    H[0], H[7], H[8] = north, -ld, le
+                elif r == 1:
+                    H[1], H[6], H[8] = east, ld, -ln
+                elif r == 2:
+                    H[2], H[6], H[7] = 1.0, le, -ln
+                elif r == 3:
+                    H[3], H[7], H[8] = 1.0, -sd, se
+                elif r == 4:
+                    H[4], H[6], H[8] = 1.0, sd, -sn
+                else:
+                    H[5], H[6], H[7] = 1.0, -se, sn
+                innovation = z[r]
+                for i in range(9):
+                    innovation -= H[i] * x[i]
+                spread = innovation_variance_kernel(P_sqrt, H, variance[m, r])
+                nis[m, r] = innovation * innovation / spread
+                used[m, r] = nis[m, r] <= gate
+                if used[m, r]:
+                    update_scalar_kernel(x, P_sqrt, H, innovation, variance[m, r])
+            state[0] -= x[0]
+            state[1] -= x[1]
+            for i in range(2, 6):
+                state[i] -= x[i]
+            e0, e1, e2, e3 = exponential(x[6], x[7], x[8])
+            q0, q1, q2, q3 = multiply(e0, e1, e2, e3, q0, q1, q2, q3)
+            state[6], state[7], state[8], state[9] = q0, q1, q2, q3
+            for i in range(6):
+                b[i] += x[9 + i]
+        for i in range(10):
+            out[k + 1, i] = state[i]
+        for i in range(6):
+            bias[k + 1, i] = b[i]
+        for i in range(15):
+            s = 0.0
+            for j in range(i + 1):
+                s += P_sqrt[i, j] * P_sqrt[i, j]
+            sigma[k + 1, i] = math.sqrt(s)
     return interval.shape[0]
