@@ -6,6 +6,8 @@ rotates; no normal equations, no difference of covariances.
 - **Chain.** `Chain` holds the rows of a block-bidiagonal Gauss-Markov model, `solve_chain` gives all states with their
   covariances, NIS and residual statistics, `ChainFilter` takes the same rows live in constant memory. `increment_chain` and
   `constant_velocity_chain` make the rows of the usual states.
+- **Constants and few noises.** `solve_bordered_chain`: rows that also hold constants (scale, lever arm, run bias);
+  `solve_driven_chain`: process noise of a rank below n.
 - **Groups.** `group_least_squares` finds unknowns group by group, by projections kept as orthonormal bases.
 - **Covariance roots.** `predict`, `update`, `smooth` on P_sqrt (lower triangular, positive diagonal, P = P_sqrt P_sqrt^T);
   `inverse_root` whitens, `lower_root` takes roots, `repair_covariance` mends rounding. Compiled loops elsewhere call
@@ -20,9 +22,11 @@ Conventions: innovation = measured - predicted; whitened numbers have unit varia
 epoch k couples to epoch k + 1 by M_k x_k + L_k x_(k+1) = u_k.
 """
 
-from railnav.estimation.chain import Chain, ChainSolution, solve_chain
+from railnav.estimation.bordered import BorderedSolution, solve_bordered_chain
+from railnav.estimation.chain import Chain, ChainSolution, fixed_lag, solve_chain
 from railnav.estimation.chain_filter import BlockResult, ChainFilter, FilterEstimate, SweepResult
 from railnav.estimation.consistency import Consistency, Coverage, consistency, coverage, nees
+from railnav.estimation.driven import DrivenSolution, solve_driven_chain
 from railnav.estimation.gross_error import (
     BlockTest,
     GeometricTest,
@@ -49,11 +53,13 @@ from railnav.estimation.square_root import (
 __all__ = [
     "BlockResult",
     "BlockTest",
+    "BorderedSolution",
     "Chain",
     "ChainFilter",
     "ChainSolution",
     "Consistency",
     "Coverage",
+    "DrivenSolution",
     "FilterEstimate",
     "GeometricTest",
     "GroupSolution",
@@ -67,6 +73,7 @@ __all__ = [
     "consistency",
     "constant_velocity_chain",
     "coverage",
+    "fixed_lag",
     "geometric_test",
     "geometric_tolerance",
     "group_least_squares",
@@ -77,6 +84,8 @@ __all__ = [
     "predict",
     "repair_covariance",
     "smooth",
+    "solve_bordered_chain",
     "solve_chain",
+    "solve_driven_chain",
     "update",
 ]

@@ -168,6 +168,9 @@ class ChainSolution:
     nis, dof : (N,) array
         Sum of squared residuals and number of redundant rows of each epoch's observations: nu^T S^-1 nu of the innovation,
         chi-square with ``dof`` degrees of freedom if the model holds.
+    log_evidence : (N,) array or None
+        ln p(z_k | all rows before), but for ln |det W_k| of the whitening, which must be added where hypotheses differ in it;
+        NaN while the rows before do not determine the state (rail 15.4).
     rejected : (N,) bool array
         Epochs whose observations failed the gate and were left out (`nis` still says by how much).
     coupling_nis, coupling_dof : (N - 1,) array
@@ -184,6 +187,7 @@ class ChainSolution:
     filtered: FloatArray | None
     nis: FloatArray
     dof: IntArray
+    log_evidence: FloatArray | None
     rejected: BoolArray
     coupling_nis: FloatArray
     coupling_dof: IntArray
@@ -277,6 +281,7 @@ def solve_chain(
     *,
     covariance: bool = True,
     filtered: bool = False,
+    evidence: bool = False,
     gate: float | None = None,
     allow_breaks: bool = False,
 ) -> ChainSolution:
@@ -294,6 +299,8 @@ def solve_chain(
         Give `covariance` and `lag_one`.
     filtered : bool
         Give the forward estimates too.
+    evidence : bool
+        Give `log_evidence`.
     gate : float, optional
         Leave out an epoch's observations if their NIS is less likely than this, e.g. 1e-4 (rail 17); none by default.
     allow_breaks : bool
@@ -329,7 +336,7 @@ def solve_chain(
         raise EstimationError("a stretch that continues a chain (lead = 1) is for ChainFilter.sweep")
     N, n = len(chain), chain.n
     triangle = start_triangle(chain.prior, n)
-    sweep = sweep_chain(chain, triangle, store=True, filtered=filtered, gate=gate)
+    sweep = sweep_chain(chain, triangle, store=True, filtered=filtered, gate=gate, evidence=evidence)
     if sweep.broken >= 0 and not allow_breaks:
         raise EstimationError(
             f"the link between epochs {sweep.broken} and {sweep.broken + 1} couples nothing; "
@@ -357,6 +364,7 @@ def solve_chain(
         filtered=sweep.filtered if filtered else None,
         nis=sweep.nis,
         dof=sweep.dof,
+        log_evidence=sweep.log_evidence if evidence else None,
         rejected=sweep.rejected,
         coupling_nis=sweep.coupling_nis,
         coupling_dof=sweep.coupling_dof,
@@ -376,10 +384,13 @@ class Sweep:
     coupling_nis: FloatArray
     coupling_dof: IntArray
     filtered: FloatArray
+    log_evidence: FloatArray
     broken: int
 
 
-def sweep_chain(chain: Chain, triangle: FloatArray, *, store: bool, filtered: bool, gate: float | None) -> Sweep:
+def sweep_chain(
+    chain: Chain, triangle: FloatArray, *, store: bool, filtered: bool, gate: float | None, evidence: bool = False
+) -> Sweep:
     """Run the forward kernel over a chain or a stretch of one; `triangle` is overwritten. Inside this room only."""
     N, n, links, m = len(chain), chain.n, len(chain.coupling_counts), chain.z.shape[1]
     limits = np.empty(0) if gate is None else np.array([np.inf, *(chi_square_limit(i + 1, gate) for i in range(m))])
@@ -391,13 +402,68 @@ def sweep_chain(chain: Chain, triangle: FloatArray, *, store: bool, filtered: bo
         coupling_nis=np.empty(links),
         coupling_dof=np.empty(links, np.int64),
         filtered=np.empty((N if filtered else 0, n)),
+        log_evidence=np.empty(N if evidence else 0),
         broken=-1,
     )
     forward = _kernels.forward_kernel(compiled_size(n))
     out.broken = forward(
         chain.H, chain.z, chain.counts, chain.M, chain.L, chain.u, chain.coupling_counts, chain.lead, triangle, limits,
-        out.records, out.nis, out.dof, out.rejected, out.coupling_nis, out.coupling_dof, out.filtered,
+        out.records, out.nis, out.dof, out.rejected, out.coupling_nis, out.coupling_dof, out.filtered, out.log_evidence,
     )  # fmt: skip
+    if evidence:
+        out.log_evidence -= 0.5 * (out.nis + out.dof * np.log(2 * np.pi))
+    return out
+
+
+def fixed_lag(solution: ChainSolution, lag: int) -> FloatArray:
+    """Give each state as estimated from the rows up to `lag` epochs later, x_(k-lag | k) (rail 15.3).
+
+    Records are final: only the starting vector x_(k|k) of the substitution changes from epoch to epoch.
+
+    Parameters
+    ----------
+    solution : ChainSolution
+        Solved with ``filtered=True``.
+    lag : int
+        Epochs to look ahead, at least 0.
+
+    Returns
+    -------
+    (N - lag, n) array
+        x_(i | i + lag) for i = 0 ... N - lag - 1; NaN where the rows up to i + lag do not determine the state.
+
+    Raises
+    ------
+    EstimationError
+        The lag is negative or not shorter than the chain, or the chain was solved without filtered estimates.
+
+    Notes
+    -----
+    Work is O(lag n^2) per epoch. Live, and with covariances, `ChainFilter.lagged` gives the same.
+
+    Examples
+    --------
+    >>> chain = Chain(np.ones((1, 1)), [[0.0], [1.1], [1.9]], [[-1.0]], [[1.0]], [[1.0], [1.0]])
+    >>> fixed_lag(solve_chain(chain, filtered=True), 2).ravel()
+    array([0.0125])
+    """
+    if solution.filtered is None:
+        raise EstimationError("the chain was solved without filtered estimates; solve_chain(..., filtered=True)")
+    N, n = solution.state.shape
+    if not 0 <= lag < N:
+        raise EstimationError(f"lag {lag} is not within 0 to {N - 1}, the epochs of the chain")
+    out = solution.filtered[lag:].copy()
+    good = np.isfinite(out).all(axis=1)
+    for back in range(1, lag + 1):
+        records = solution.records[lag - back : N - back]
+        # an empty pivot before the state is determined: that estimate does not exist
+        good &= (np.einsum("kii->ki", records[:, :, :n]) != 0).all(axis=1)
+        R = np.where(good[:, None, None], records[:, :, :n], np.eye(n))
+        right = records[:, :, 2 * n] - np.einsum(
+            "kij,kj->ki", records[:, :, n : 2 * n], np.where(good[:, None], out, 0.0)
+        )
+        out = np.asarray(np.linalg.solve(R, right[:, :, None])[:, :, 0])
+    out[~good] = np.nan
     return out
 
 

@@ -67,6 +67,8 @@ class SweepResult:
         As in `ChainSolution`.
     filtered : (N, n) array or None
         Estimates from the rows up to each epoch, NaN while they do not exist.
+    log_evidence : (N,) array or None
+        As in `ChainSolution`.
     """
 
     nis: FloatArray
@@ -75,6 +77,7 @@ class SweepResult:
     coupling_nis: FloatArray
     coupling_dof: IntArray
     filtered: FloatArray | None
+    log_evidence: FloatArray | None
 
 
 class ChainFilter:
@@ -202,6 +205,7 @@ class ChainFilter:
         coupling_counts: ArrayLike | None = None,
         gate: float | None = None,
         filtered: bool = False,
+        evidence: bool = False,
     ) -> SweepResult:
         """Take many epochs at once, as arrays; the first call starts the chain, later ones continue it.
 
@@ -217,6 +221,8 @@ class ChainFilter:
             As in `solve_chain`.
         filtered : bool
             Give the estimate at each epoch.
+        evidence : bool
+            Give the log-evidence of each epoch.
 
         Returns
         -------
@@ -230,7 +236,7 @@ class ChainFilter:
         """
         lead = 1 if self._epoch >= 0 else 0
         stretch = Chain(H, z, M, L, u, counts=counts, coupling_counts=coupling_counts, lead=lead)
-        result = self._take(stretch, gate=gate, filtered=filtered)
+        result = self._take(stretch, gate=gate, filtered=filtered, evidence=evidence)
         return SweepResult(
             result.nis,
             result.dof,
@@ -238,6 +244,7 @@ class ChainFilter:
             result.coupling_nis,
             result.coupling_dof,
             result.filtered if filtered else None,
+            result.log_evidence if evidence else None,
         )
 
     def estimate(self) -> FilterEstimate:
@@ -292,13 +299,15 @@ class ChainFilter:
         _kernels.covariance_chain_kernel(compiled_size(n))(records, self._triangle, P, np.empty((0, n, n)))
         return FilterEstimate(self._epoch - lag, state[0], P[0])
 
-    def _take(self, stretch: Chain, *, gate: float | None = None, filtered: bool = False) -> Sweep:
+    def _take(
+        self, stretch: Chain, *, gate: float | None = None, filtered: bool = False, evidence: bool = False
+    ) -> Sweep:
         """Sweep a stretch; if that fails, the filter is as it was."""
         if stretch.n != self.n:
             raise EstimationError(f"the rows have {stretch.n} coefficients; the filter's states have {self.n}")
         lag = self._records.maxlen or 0
         triangle = self._triangle.copy()
-        result = sweep_chain(stretch, triangle, store=lag > 0, filtered=filtered, gate=gate)
+        result = sweep_chain(stretch, triangle, store=lag > 0, filtered=filtered, gate=gate, evidence=evidence)
         if not np.isfinite(triangle).all():
             raise EstimationError(stretch.blame())
         first = max(self._epoch, 0)
