@@ -16,6 +16,10 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+#: Parts of a compiled loop: they cannot be called from Python, and count no references to the arrays they are lent, which halves
+#: both the time to compile and the time to run. They must not make arrays.
+part = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)
+
 #: Columns of a packed knot: one cache line of eight doubles. Tangents are grid metres per metre of offset.
 OFFSET, EAST, NORTH, D_EAST, D_NORTH, CURVATURE, GRADIENT, CANT = range(8)
 #: Columns of an evaluated point of a path: as a knot without its offset, and d(gradient)/ds.
@@ -60,7 +64,7 @@ class Bank(NamedTuple):
 
 @njit(cache=True)
 def track_point(net, track, way, local, out):  # m from the entering end -> out (POINT_SIZE,)
-    """Evaluate a track at a distance from the end where it is entered: cubic Hermite position, linear curvature; straight beyond its ends."""
+    """Evaluate a track at a distance from the end where it is entered: cubic Hermite position, linear curvature, straight beyond."""
     first = net.knot_start[track]
     last = net.knot_start[track + 1] - 1
     length = net.length[track]
@@ -104,10 +108,8 @@ def track_point(net, track, way, local, out):  # m from the entering end -> out 
     out[P_GRADIENT_RATE] = (knots[j + 1, GRADIENT] - knots[j, GRADIENT]) / h if over == 0.0 else 0.0
 
 
-@njit(cache=True)
-def path_index(
-    net, bank, h, s, start
-):  # path coordinate, index to start from -> index of the window's track that holds it
+@part
+def path_index(bank, h, s, start):  # path coordinate, index to start from -> index of the window's track that holds it
     """Which track of a hypothesis' window holds a path coordinate; the first and last hold all that lies beyond."""
     i = start
     while i > 0 and s < bank.begin[h, i]:
@@ -118,10 +120,10 @@ def path_index(
     return i
 
 
-@njit(cache=True)
+@part
 def path_point(net, bank, h, s, out):  # path coordinate -> out (POINT_SIZE,)
     """Evaluate a hypothesis' path at a path coordinate; gives the index in its window."""
-    i = path_index(net, bank, h, s, bank.tags[h, CURRENT])
+    i = path_index(bank, h, s, bank.tags[h, CURRENT])
     track_point(net, bank.track[h, i], bank.way[h, i], s - bank.begin[h, i], out)
     return i
 
@@ -138,7 +140,7 @@ def take_slot(bank):
     return -1
 
 
-@njit(cache=True)
+@part
 def drop(bank, i):
     """Drop the i-th living hypothesis; the last one moves to its place."""
     n = bank.live[0]
@@ -148,6 +150,14 @@ def drop(bank, i):
 
 
 @njit(cache=True)
+def drop_all(bank):
+    """Drop every hypothesis."""
+    for h in range(bank.used.shape[0]):
+        bank.used[h] = 0
+    bank.live[0] = 0
+
+
+@part
 def drop_lightest(bank, keep):
     """Drop the lightest hypothesis other than slot `keep`."""
     worst = -1
@@ -159,38 +169,44 @@ def drop_lightest(bank, keep):
         drop(bank, worst)
 
 
-@njit(cache=True)
+@part
 def clone(bank, h):
     """Copy a hypothesis; gives the new slot."""
     g = take_slot(bank)
     if g < 0:
         drop_lightest(bank, h)
         g = take_slot(bank)
-    bank.x[g] = bank.x[h]
-    bank.P_sqrt[g] = bank.P_sqrt[h]
+    n = bank.x.shape[1]
+    for i in range(n):
+        bank.x[g, i] = bank.x[h, i]
+        for j in range(n):
+            bank.P_sqrt[g, i, j] = bank.P_sqrt[h, i, j]
     bank.logw[g] = bank.logw[h]
-    bank.track[g] = bank.track[h]
-    bank.way[g] = bank.way[h]
-    bank.begin[g] = bank.begin[h]
-    bank.armed[g] = bank.armed[h]
-    bank.tags[g] = bank.tags[h]
-    bank.info[g] = bank.info[h]
+    for i in range(bank.track.shape[1]):
+        bank.track[g, i] = bank.track[h, i]
+        bank.way[g, i] = bank.way[h, i]
+        bank.begin[g, i] = bank.begin[h, i]
+        bank.armed[g, i] = bank.armed[h, i]
+    for i in range(TAGS):
+        bank.tags[g, i] = bank.tags[h, i]
+    for i in range(INFO):
+        bank.info[g, i] = bank.info[h, i]
     return g
 
 
-@njit(cache=True)
+@part
 def leaving_end(track, way):
     """Track end by which a train that runs this way leaves."""
     return 2 * track + (1 if way > 0 else 0)
 
 
-@njit(cache=True)
+@part
 def entering_end(track, way):
     """Track end by which a train that runs this way entered."""
     return 2 * track + (0 if way > 0 else 1)
 
 
-@njit(cache=True)
+@part
 def append(net, bank, h, target):
     """Append the track entered by `target` (a track end) to the far end of a window, dropping its oldest track when full."""
     window = bank.track.shape[1]
@@ -213,7 +229,7 @@ def append(net, bank, h, target):
     bank.tags[h, VERSION] = -1
 
 
-@njit(cache=True)
+@part
 def prepend(net, bank, h, source):
     """Put the track that is left by `source` (a track end) before a window, dropping its farthest track when full."""
     window = bank.track.shape[1]
@@ -235,7 +251,7 @@ def prepend(net, bank, h, source):
     bank.tags[h, VERSION] = -1
 
 
-@njit(cache=True)
+@part
 def follow(
     net, bank, h, s, speed, margin
 ):  # m, m/s, m -> 0: the path reaches on both sides, 1: it ends ahead, -1: behind
@@ -244,7 +260,7 @@ def follow(
     Where the way is known it stays known: going back, a train returns as it came, and alternatives are taken up only at switches
     that were far enough out of reach to have been thrown.
     """
-    track, way, begin, armed, tags = bank.track, bank.way, bank.begin, bank.armed, bank.tags
+    track, way, begin, tags = bank.track, bank.way, bank.begin, bank.tags
     ends = 0
     # ahead: new tracks
     while True:
@@ -283,7 +299,7 @@ def follow(
     return ends
 
 
-@njit(cache=True)
+@part
 def _rearm(net, bank, h, s, speed, margin):
     """Arm the switches that are out of reach, and take up the alternatives of an armed one that comes into reach again."""
     track, way, begin, armed, tags = bank.track, bank.way, bank.begin, bank.armed, bank.tags
@@ -324,7 +340,7 @@ def _rearm(net, bank, h, s, speed, margin):
                     prepend(net, bank, g, net.move_to[k])
 
 
-@njit(cache=True)
+@part
 def normalise(bank, weight, floor, keep):
     """Scale log-weights so that the posterior sums to 1, drop what falls below `floor` and keep at most `keep`; weight by slot."""
     top = -np.inf
@@ -355,8 +371,8 @@ def normalise(bank, weight, floor, keep):
         bank.logw[h] -= shift
 
 
-@njit(cache=True)
-def same_path(net, bank, a, b, s_a, margin):
+@part
+def same_path(bank, a, b, s_a, margin):
     """Whether two hypotheses stand on the same track, mean to go the same way, and came the same way within `margin` of s_a."""
     i, j = bank.tags[a, CURRENT], bank.tags[b, CURRENT]
     if bank.track[a, i] != bank.track[b, j] or bank.way[a, i] != bank.way[b, j]:
@@ -374,7 +390,7 @@ def same_path(net, bank, a, b, s_a, margin):
     return True
 
 
-@njit(cache=True)
+@part
 def add_column(P_sqrt, u, first):  # (n, n) lower triangular, (n,) destroyed: P += u u^T
     """Rotate one more column into a covariance root (Givens), beginning at the first row where it is not zero."""
     n = u.shape[0]
@@ -392,7 +408,7 @@ def add_column(P_sqrt, u, first):  # (n, n) lower triangular, (n,) destroyed: P 
             u[i] = c * u[i] - s * t
 
 
-@njit(cache=True)
+@part
 def merge(bank, a, b, offset, position, column):  # slots; m; state index; scratch (n,)
     """Fold hypothesis b into a by matching moments: mu = sum w mu, P = sum w (P + d d^T); b's position is shifted by `offset`."""
     n = bank.x.shape[1]
@@ -422,8 +438,8 @@ def merge(bank, a, b, offset, position, column):  # slots; m; state index; scrat
     add_column(P, column, 0)
 
 
-@njit(cache=True)
-def merge_all(net, bank, position, speed, threshold, column):
+@part
+def merge_all(bank, position, speed, threshold, column):
     """Merge hypotheses on the same path whose position and speed differ by a Mahalanobis distance below `threshold`."""
     i = 0
     while i < bank.live[0]:
@@ -444,7 +460,7 @@ def merge_all(net, bank, position, speed, threshold, column):
                     pv += L[position, k] * L[speed, k]
                     vv += L[speed, k] * L[speed, k]
             s = bank.x[a, position]
-            if not same_path(net, bank, a, b, s, 4.0 * math.sqrt(pp) + 10.0):
+            if not same_path(bank, a, b, s, 4.0 * math.sqrt(pp) + 10.0):
                 j += 1
                 continue
             offset = bank.begin[a, bank.tags[a, CURRENT]] - bank.begin[b, bank.tags[b, CURRENT]]

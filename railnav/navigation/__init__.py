@@ -1,7 +1,8 @@
 """Navigation: a train held to its track model: where on which track, how fast, how sure."""
 
 from railnav.navigation.epochs import Epoch, epochs
-from railnav.navigation.navigator import Alternative, Navigator, Position, navigate
+from railnav.navigation.navigator import Alternative, Navigator, Position
+from railnav.navigation.offline import navigate
 from railnav.navigation.solution import Mode, Solution
 from railnav.navigation.state import Settings, State, layout
 

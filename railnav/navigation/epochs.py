@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railnav.errors import RunError
-from railnav.navigation import _kernels as kernel
-from railnav.run import GnssStream, ImuStream, OdometerStream, Run
+from railnav.navigation import columns as kernel
+from railnav.run import ImuStream, OdometerStream, Run
 
 if TYPE_CHECKING:
     from railnav.track.model import TrackModel

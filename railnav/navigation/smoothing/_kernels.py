@@ -6,8 +6,9 @@ import numpy as np
 from numba import njit
 
 from railnav.estimation._kernels import smooth_kernel
-from railnav.navigation._kernels import (
+from railnav.navigation.columns import (
     FORCE,
+    NOISES,
     POSITION,
     R_EPOCH,
     R_PARENT,
@@ -20,8 +21,8 @@ from railnav.navigation._kernels import (
     R_VERSION,
     SPEED,
     TIME,
-    transition,
 )
+from railnav.navigation.dynamics._kernels import transition, variance_of
 
 
 @njit(cache=True)
@@ -40,7 +41,7 @@ def lineage(records, last, chain):  # record index, (m,) out by epoch: record in
 def window_index(records, version, s):  # path coordinate -> index in a stored window
     """Which track of a stored window holds a path coordinate."""
     i = 0
-    while i < records.count[version] - 1 and s >= records.begin[version, i + 1]:
+    while i < records.tracks[version] - 1 and s >= records.begin[version, i + 1]:
         i += 1
     return i
 
@@ -52,8 +53,8 @@ def smooth_lineage(fil, records, epochs, chain, first, last, x, sigma):
     n = x.shape[1]
     i_s, i_v = fil.at[POSITION], fil.at[SPEED]
     F = np.empty((n, n))
-    Q = np.empty((16, n))
-    lead = np.empty(16, np.int64)
+    Q = np.empty((NOISES, n))
+    lead = np.empty(NOISES, np.int64)
     new = np.empty(n)
     gain = np.empty((n, n))
     state = records.x[chain[last]].copy()
@@ -64,10 +65,12 @@ def smooth_lineage(fil, records, epochs, chain, first, last, x, sigma):
         if e < last:
             r = chain[e]
             numbers = records.numbers[chain[e + 1]]
-            next_state[:] = state
-            next_P[:] = P_sqrt
-            state[:] = records.x[r]
-            P_sqrt[:] = records.P_sqrt[r]
+            for i in range(n):
+                next_state[i] = state[i]
+                state[i] = records.x[r, i]
+                for j in range(n):
+                    next_P[i, j] = P_sqrt[i, j]
+                    P_sqrt[i, j] = records.P_sqrt[r, i, j]
             dt = epochs[e + 1, TIME] - epochs[e, TIME]
             columns = transition(
                 fil,
@@ -86,14 +89,10 @@ def smooth_lineage(fil, records, epochs, chain, first, last, x, sigma):
                 new,
             )
             smooth_kernel(state, P_sqrt, F, np.ascontiguousarray(Q[:columns].T), new, next_state, next_P, gain)
-        x[e] = state
-        p = 0.0
-        q = 0.0
-        for j in range(n):
-            p += P_sqrt[i_s, j] ** 2
-            q += P_sqrt[i_v, j] ** 2
-        sigma[e, 0] = np.sqrt(p)
-        sigma[e, 1] = np.sqrt(q)
+        for i in range(n):
+            x[e, i] = state[i]
+        sigma[e, 0] = np.sqrt(variance_of(P_sqrt, i_s))
+        sigma[e, 1] = np.sqrt(variance_of(P_sqrt, i_v))
 
 
 @njit(cache=True)

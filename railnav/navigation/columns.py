@@ -1,0 +1,252 @@
+"""What the navigator's kernels agree on: columns of their tables by name, and the arrays that travel together."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railnav.navigation.solution import Mode
+from railnav.navigation.state import SETTING, State
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+FRAME_EAST, FRAME_NORTH, GNSS_EAST, GNSS_NORTH = (
+    int(State.FRAME_EAST),
+    int(State.FRAME_NORTH),
+    int(State.GNSS_EAST),
+    int(State.GNSS_NORTH),
+)
+TIME_TAG, SPEED_LATENCY, SPEED_ERROR = int(State.TIME_TAG), int(State.SPEED_LATENCY), int(State.SPEED_ERROR)
+ODOMETER_SCALE, GYRO_BIAS, ACCELEROMETER_BIAS = (
+    int(State.ODOMETER_SCALE),
+    int(State.GYRO_BIAS),
+    int(State.ACCELEROMETER_BIAS),
+)
+ACCELERATION, SPEED, POSITION, WHEEL_DISTANCE = (
+    int(State.ACCELERATION),
+    int(State.SPEED),
+    int(State.POSITION),
+    int(State.WHEEL_DISTANCE),
+)
+
+INITIALISING, TRACKING, COASTING, AMBIGUOUS, OFF_MODEL, LOST = (
+    int(Mode.INITIALISING),
+    int(Mode.TRACKING),
+    int(Mode.COASTING),
+    int(Mode.AMBIGUOUS),
+    int(Mode.OFF_MODEL),
+    int(Mode.LOST),
+)
+
+# settings by name
+K_GNSS_TIME = SETTING["gnss_correlation_time"]
+K_CORRELATED = SETTING["gnss_correlated_share"]
+K_WHITE = SETTING["gnss_white_share"]
+K_FRAME = SETTING["gnss_frame_share"]
+K_FRAME_LEAST = SETTING["frame_sigma_least"]
+K_MODEL = SETTING["model_sigma"]
+K_FRAME_MOST = SETTING["frame_sigma_most"]
+K_SCALE_START = SETTING["scale_start"]
+K_SCALE_PRIOR = SETTING["scale_prior"]
+K_SCALE_LEAST = SETTING["scale_least"]
+K_SCALE_MOST = SETTING["scale_most"]
+K_GATE = SETTING["gate"]
+K_STEP_FIXES = SETTING["step_fixes"]
+K_LOST_AFTER = SETTING["lost_after"]
+K_TAG_WALK = SETTING["time_tag_walk"]
+K_TAG_MOST = SETTING["time_tag_most"]
+K_SPEED_SIGMA = SETTING["speed_sigma"]
+K_SPEED_SHARE = SETTING["speed_error_share"]
+K_SPEED_TIME = SETTING["speed_error_time"]
+K_COURSE_SIGMA = SETTING["course_sigma"]
+K_ACC_SIGMA = SETTING["acceleration_sigma"]
+K_ACC_TIME = SETTING["acceleration_time"]
+K_FORCE_NOISE = SETTING["accelerometer_noise"]
+K_FORCE_WALK = SETTING["accelerometer_walk"]
+K_GYRO_WALK = SETTING["gyro_walk"]
+K_GYRO_FLOOR = SETTING["gyro_floor"]
+K_GYRO_SCALE = SETTING["gyro_scale"]
+K_CURVATURE_SIGMA = SETTING["curvature_sigma"]
+K_CURVATURE_SHIFT = SETTING["curvature_shift"]
+K_CURVATURE_LENGTH = SETTING["curvature_length"]
+K_ODOMETER_WALK = SETTING["odometer_scale_walk"]
+K_ODOMETER_SIGMA = SETTING["odometer_sigma"]
+K_ODOMETER_SLIP = SETTING["odometer_slip"]
+K_ODOMETER_SPEED = SETTING["odometer_speed_sigma"]
+K_SLIP_GATE = SETTING["slip_gate"]
+K_SLIP_LONGEST = SETTING["slip_longest"]
+K_STILL_SIGMA = SETTING["standstill_sigma"]
+K_STILL_TIME = SETTING["standstill_time"]
+K_REVERSE = SETTING["reverse_prior"]
+K_CONFIDENCE = SETTING["track_confidence"]
+K_COASTING = SETTING["coasting_after"]
+K_LOST_SIGMA = SETTING["lost_sigma"]
+K_USABLE = SETTING["sigma_usable"]
+K_MEMORY = SETTING["evidence_memory"]
+K_MERGE = SETTING["merge_distance"]
+K_PRUNE = SETTING["prune_below"]
+K_MOST = SETTING["most_hypotheses"]
+K_GRAVITY = SETTING["gravity"]
+
+#: Columns of the epoch table: what one epoch brings, NaN where it brings none.
+(
+    TIME,
+    EAST,  # GNSS antenna in the grid, m
+    NORTH,
+    SIGMA_EAST,
+    SIGMA_NORTH,
+    GNSS_SPEED,
+    COURSE_EAST,  # unit vector of the course in the grid
+    COURSE_NORTH,
+    SIGMA_SPEED,
+    DISTANCE,  # odometer
+    WHEEL_SPEED,
+    SIGMA_WHEEL,
+    FORCE,  # forward specific force, mean since the epoch before
+    YAW_RATE,  # about the down axis, mean since the epoch before, Earth rate taken off
+    SIGMA_YAW,
+) = range(15)
+EPOCH_SIZE = 15
+
+#: Columns of the output table.
+(
+    OUT_TRACK,
+    OUT_WAY,
+    OUT_OFFSET,
+    OUT_SPEED,
+    OUT_ACCELERATION,
+    OUT_SIGMA,
+    OUT_LEVEL,
+    OUT_PROBABILITY,
+    OUT_MODE,
+    OUT_DIRECTION,
+    OUT_HYPOTHESES,
+    OUT_SIGMA_SPEED,
+    OUT_FIX_AGE,
+) = range(13)
+OUTPUT_SIZE = 13
+
+#: What all hypotheses share: clock, receiver and wheel watch, decision, counters.
+(
+    C_TIME,
+    C_FIX_TIME,
+    C_SUSPECTS,
+    C_SUSPECT_SINCE,
+    C_SCALE_SUM,
+    C_SCALE_WEIGHT,
+    C_SCALE,
+    C_FRAME_SIGMA,
+    C_SIGMA_EAST,
+    C_SIGMA_NORTH,
+    C_WHEEL_MOVED,
+    C_WHEEL_SEEN,
+    C_GNSS_STILL,
+    C_GNSS_SPEED,
+    C_GNSS_SPEED_TIME,
+    C_OUT_TRACK,
+    C_OUT_WAY,
+    C_FRESH,
+    C_TRY,
+    C_NOTHING_NEAR,
+    C_STARTED,
+    C_FIXES,
+    C_SUSPECT_FIXES,
+    C_STEPS,
+    C_SLIPS,
+    C_STARTS,
+    C_REVISIONS,
+    C_RING,
+    C_SPEED_STALE,  # 1: the receiver repeats its last speed to the last digit: no news
+    C_STOOD,  # 1: the train stood at the epoch before
+    C_JUMPS,  # steps lately, forgotten over half a minute
+    C_FRAME_TIME,  # when the constant part's prior was last looked at
+    C_DISTRUST,  # until when a receiver's resting speed is not believed: its positions moved meanwhile
+) = range(33)
+COMMON_SIZE = 33
+#: Odometer readings remembered: time, distance.
+RING = 32
+#: Wheel speed is the mean over this long, s.
+WHEEL_SPAN = 0.5
+#: Standard deviations that forget the wheel distance (m) and shake the speed (m/s).
+FORGET_WHEEL, SHAKE_SPEED = 10.0, 0.1
+#: How long a receiver that said "at rest" while its positions moved is not believed, s.
+DISTRUST = 300.0
+#: Acceleration of a departing train, m/s^2.
+KICK = 0.7
+#: Random walk of the speed while an accelerometer that should be there is silent, m/s^2/sqrt(Hz).
+SILENT_NOISE = 0.4
+#: Squared normalised innovation at which a single sensor row is held; its evidence saturates there.
+ROW_GATE = 16.0
+#: Change of curvature a metre that the linearised course allows for, 1/m^2.
+BEND_CHANGE = 1e-5
+
+#: Columns of a record's numbers, kept for the smoother.
+R_EPOCH, R_PARENT, R_VERSION, R_LOGW, R_PULL, R_SLIP, R_SHAKE, R_STEP, R_TAG, R_SIGN = range(10)
+RECORD_SIZE = 10
+#: Those of them that the filter fills as it goes: from R_PULL on.
+PULLS = 6
+
+#: Rows of `Work.vector`.
+W_NEW, W_H, W_H_NORTH, W_F, W_F_NORTH, W_KEEP, W_MOVE, W_COLUMN, W_BEFORE = range(9)
+#: Columns of `Work.slot`: what the filter did to a hypothesis (PULLS numbers as in a record), NIS and ln p of the fix, track's posterior.
+S_PULL, S_SLIP, S_SHAKE, S_STEP, S_TAG, S_SIGN, S_NIS, S_SAID, S_MASS = range(9)
+SLOT_SIZE = 9
+#: Noise columns at most.
+NOISES = 16
+
+#: Why the loop stopped.
+DONE, NEEDS_START, NEEDS_ROOM = range(3)
+
+GAUSS_HERMITE_NODES = np.array([-2.8569700138728056, -1.355626179974266, 0.0, 1.355626179974266, 2.8569700138728056])
+GAUSS_HERMITE_WEIGHTS = np.array(
+    [0.011257411327720689, 0.2220759220056126, 0.5333333333333333, 0.2220759220056126, 0.011257411327720689]
+)
+
+
+class Filter(NamedTuple):
+    """What stays the same over a run."""
+
+    at: IntArray  # (14,) index of each state, -1 absent
+    settings: FloatArray  # Settings.packed()
+    lever: FloatArray  # (3,) reference point to antenna: forward, right, down, m
+    risk: FloatArray  # (2,) integrity risk, two-sided normal quantile
+    signed: int  # 1: the odometer counts backwards when backing up
+
+
+class Shared(NamedTuple):
+    """What all hypotheses share and every epoch changes."""
+
+    common: FloatArray  # (COMMON_SIZE,)
+    ring: FloatArray  # (RING, 2)
+    weight: FloatArray  # (slots,)
+
+
+class Work(NamedTuple):
+    """Room to work in, made once."""
+
+    F: FloatArray  # (n, n)
+    Q: FloatArray  # (NOISES, n) one noise column a row
+    lead: IntArray  # (NOISES,) first row of each noise column
+    vector: FloatArray  # (9, n): W_...
+    point: FloatArray  # (slots, POINT_SIZE + 1): geometry at each hypothesis' predicted position, and that position
+    probe: FloatArray  # (POINT_SIZE + 1,)
+    place: FloatArray  # (4,): antenna and its derivative
+    fix: FloatArray  # (7,): innovation E, N; white variance E, N; innovation covariance EE, NN, EN
+    slot: FloatArray  # (slots, SLOT_SIZE): S_...
+    mix: FloatArray  # (3, slots): weight, mean, sigma along the track
+
+
+class Records(NamedTuple):
+    """What the smoother needs: one record a hypothesis and epoch; windows by version. Empty arrays when nothing is kept."""
+
+    x: FloatArray  # (records, n)
+    P_sqrt: FloatArray  # (records, n, n)
+    numbers: FloatArray  # (records, RECORD_SIZE)
+    track: IntArray  # (versions, window)
+    way: IntArray  # (versions, window)
+    begin: FloatArray  # (versions, window)
+    tracks: IntArray  # (versions,) how many tracks of the window count
+    used: IntArray  # (3,) records, versions, whether records are kept

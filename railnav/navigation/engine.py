@@ -1,0 +1,278 @@
+"""The filter with its tables: what the live navigator and the offline run share."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from railnav.matching import _kernels as paths
+from railnav.matching.candidates import starting_candidates
+from railnav.matching.network import pack_network
+from railnav.navigation import _kernels as kernel
+from railnav.navigation import columns as c
+from railnav.navigation.integrity import normal_quantile
+from railnav.navigation.state import Settings, State, layout
+
+if TYPE_CHECKING:
+    from railnav.track.model import TrackModel
+
+FloatArray = NDArray[np.float64]
+
+#: Hypotheses that fit at a time (more than are kept, for those at a start or a fan of turnouts), and tracks in a window.
+SLOTS, WINDOW = 48, 12
+
+
+class Engine:
+    """All hypotheses of one run on one model.
+
+    Parameters
+    ----------
+    model : TrackModel
+    settings : Settings
+    imu, odometer, speed, signed_odometer, lever_arm_b, integrity_risk
+        As for `railnav.navigation.Navigator`.
+    records : int
+        Room for the smoother's records, to begin with; 0 keeps none.
+    """
+
+    __slots__ = ("bank", "filter", "model", "network", "records", "settings", "shared", "work")
+
+    def __init__(
+        self,
+        model: TrackModel,
+        settings: Settings,
+        *,
+        imu: bool,
+        odometer: str,
+        speed: bool,
+        signed_odometer: bool,
+        lever_arm_b: ArrayLike,
+        integrity_risk: float,
+        records: int = 0,
+    ) -> None:
+        if not 0.0 < integrity_risk < 1.0:
+            raise ValueError(f"integrity_risk {integrity_risk} is not between 0 and 1")
+        if odometer not in ("distance", "speed", ""):
+            raise ValueError(f"odometer {odometer!r} is not 'distance', 'speed' or ''")
+        self.model = model
+        self.settings = _settings_for(model, settings)
+        self.network = pack_network(model)
+        at = layout(imu=imu, odometer=odometer, speed=speed)
+        n = int(at.max()) + 1
+        self.filter = c.Filter(
+            at,
+            self.settings.packed(),
+            np.array(lever_arm_b, np.float64).reshape(3),
+            np.array([integrity_risk, normal_quantile(integrity_risk)]),
+            int(signed_odometer),
+        )
+        self.bank = paths.Bank(
+            np.zeros((SLOTS, n)),
+            np.zeros((SLOTS, n, n)),
+            np.zeros(SLOTS),
+            np.zeros((SLOTS, WINDOW), np.int64),
+            np.ones((SLOTS, WINDOW), np.int64),
+            np.zeros((SLOTS, WINDOW)),
+            np.zeros((SLOTS, WINDOW), np.int64),
+            np.zeros((SLOTS, paths.TAGS), np.int64),
+            np.zeros((SLOTS, paths.INFO)),
+            np.zeros(SLOTS + 1, np.int64),
+            np.zeros(SLOTS, np.int64),
+        )
+        common = np.zeros(c.COMMON_SIZE)
+        never = [c.C_TIME, c.C_FIX_TIME, c.C_TRY, c.C_WHEEL_SEEN, c.C_GNSS_SPEED_TIME, c.C_DISTRUST]
+        common[never] = -np.inf
+        common[[c.C_WHEEL_MOVED, c.C_GNSS_STILL]] = np.inf
+        common[c.C_SCALE] = self.settings.scale_start
+        common[c.C_OUT_TRACK] = -1.0
+        ring = np.column_stack([np.full(c.RING, -np.inf), np.full(c.RING, np.nan)])
+        self.shared = c.Shared(common, ring, np.zeros(SLOTS))
+        self.work = c.Work(
+            np.zeros((n, n)),
+            np.zeros((c.NOISES, n)),
+            np.zeros(c.NOISES, np.int64),
+            np.zeros((9, n)),
+            np.zeros((SLOTS, paths.POINT_SIZE + 1)),
+            np.zeros(paths.POINT_SIZE + 1),
+            np.zeros(4),
+            np.zeros(7),
+            np.zeros((SLOTS, c.SLOT_SIZE)),
+            np.zeros((3, SLOTS)),
+        )
+        self.records = _records(n, records)
+
+    @property
+    def states(self) -> int:
+        """Length of the state vector."""
+        return int(self.bank.x.shape[1])
+
+    def advance(self, table: FloatArray, out: FloatArray, first: int = 0) -> None:
+        """Work through the rows of an epoch table from `first`, starting hypotheses and making room where the loop asks for it."""
+        while True:
+            first, why = kernel.run(
+                self.filter, self.network, self.shared, self.bank, self.work, self.records, table, first, out
+            )
+            if why == c.DONE:
+                return
+            if why == c.NEEDS_ROOM:
+                self.records = _grown(self.records)
+            else:
+                self._start(table[first])
+
+    def living(self) -> list[int]:
+        """Slots of the living hypotheses."""
+        slots: list[int] = self.bank.live[1 : 1 + self.bank.live[0]].tolist()
+        return slots
+
+    def place(self, slot: int) -> tuple[int, float]:
+        """Track and offset of a living hypothesis."""
+        bank = self.bank
+        i = int(bank.tags[slot, paths.CURRENT])
+        track = int(bank.track[slot, i])
+        length = float(self.network.length[track])
+        position = float(bank.x[slot, self.filter.at[State.POSITION]])
+        local = min(max(position - float(bank.begin[slot, i]), 0.0), length)
+        return track, local if bank.way[slot, i] > 0 else length - local
+
+    def _start(self, row: FloatArray) -> None:
+        """Put a hypothesis on every track near a fix, for each direction that speed and course leave open."""
+        common, bank, settings = self.shared.common, self.bank, self.settings
+        time = float(row[c.TIME])
+        common[c.C_TRY] = time
+        sigma = float(max(row[c.SIGMA_EAST], row[c.SIGMA_NORTH]))
+        found = starting_candidates(
+            self.model,
+            self.network,
+            float(row[c.EAST]),
+            float(row[c.NORTH]),
+            within=max(50.0, 4.0 * sigma),
+            overhang=2.0 * sigma + 5.0,
+        )
+        common[c.C_NOTHING_NEAR] = float(not found)
+        if not found:
+            return
+        frame = math.hypot(settings.gnss_frame_share * sigma, settings.model_sigma)
+        frame = min(max(frame, settings.frame_sigma_least), settings.frame_sigma_most)
+        common[c.C_FRAME_SIGMA] = max(frame, common[c.C_FRAME_SIGMA])
+        common[c.C_FRAME_TIME] = time + 60.0
+        common[[c.C_FRESH, c.C_STARTED]] = 1.0
+        common[c.C_STARTS] += 1.0
+        common[[c.C_SUSPECTS, c.C_STOOD]] = 0.0
+        common[[c.C_FIX_TIME, c.C_TIME]] = time
+        speed, sigma_speed = float(row[c.GNSS_SPEED]), float(row[c.SIGMA_SPEED])
+        if not sigma_speed > 0.0:
+            sigma_speed = settings.speed_sigma
+        paths.drop_all(bank)
+        point = np.empty(paths.POINT_SIZE)
+        for start in found:
+            paths.track_point(self.network, start.track, 1, start.offset, point)
+            for way, v, sigma_v, moved, prior in self._directions(row, point, speed, sigma_speed):
+                h = paths.take_slot(bank)
+                if h < 0:
+                    return
+                local = start.offset if way > 0 else float(self.network.length[start.track]) - start.offset
+                self._seed(h, local, v, sigma, sigma_v)
+                bank.logw[h] = math.log(prior)
+                bank.track[h, 0], bank.way[h, 0], bank.begin[h, 0] = start.track, way, 0.0
+                bank.armed[h] = 0
+                bank.tags[h] = 0
+                bank.tags[h, paths.COUNT] = 1
+                bank.tags[h, [paths.RECORD, paths.VERSION]] = -1
+                bank.tags[h, paths.MOVED] = int(moved)
+                bank.tags[h, paths.SIGN] = 1 if v >= 0.0 else -1
+                bank.info[h] = -np.inf
+                bank.info[h, paths.FADING] = 0.0
+
+    def _seed(self, slot: int, local: float, v: float, sigma: float, sigma_v: float) -> None:
+        """Fill state and covariance root of a new hypothesis."""
+        settings, bank, at, common = self.settings, self.bank, self.filter.at, self.shared.common
+        sd = np.ones(len(State))
+        sd[[State.FRAME_EAST, State.FRAME_NORTH]] = common[c.C_FRAME_SIGMA]
+        sd[State.TIME_TAG] = settings.time_tag_sigma
+        sd[State.SPEED_LATENCY] = settings.speed_latency
+        sd[State.ODOMETER_SCALE] = settings.odometer_scale
+        sd[State.GYRO_BIAS] = settings.gyro_bias
+        sd[State.ACCELEROMETER_BIAS] = settings.accelerometer_bias
+        sd[State.ACCELERATION] = settings.acceleration_sigma
+        sd[State.SPEED] = sigma_v
+        # as good as no prior along the track: the fix itself is let in next
+        scale = math.hypot(common[c.C_SCALE], settings.gnss_white_share)
+        sd[State.POSITION] = 3.0 * math.hypot(scale * sigma, common[c.C_FRAME_SIGMA]) + 5.0
+        reading = self.shared.ring[(int(common[c.C_RING]) - 1) % c.RING, 1]
+        sd[State.WHEEL_DISTANCE] = 100.0
+        x = np.zeros(len(State))
+        x[State.SPEED] = v
+        x[State.POSITION] = local
+        x[State.WHEEL_DISTANCE] = reading if math.isfinite(reading) else 0.0
+        bank.x[slot] = x[at >= 0]
+        bank.P_sqrt[slot] = np.diag(sd[at >= 0])
+
+    def _directions(
+        self, row: FloatArray, point: FloatArray, speed: float, sigma_speed: float
+    ) -> list[tuple[int, float, float, bool, float]]:
+        """Directions of the nose worth a hypothesis on a track, with speed, its sigma, whether it moves, and the prior."""
+        sigma = math.hypot(sigma_speed, 0.5)
+        if not math.isfinite(speed):
+            return [(1, 0.0, 20.0, False, 0.5), (-1, 0.0, 20.0, False, 0.5)]
+        if speed < max(1.0, 3.0 * sigma_speed):
+            return [(1, 0.0, sigma + speed, False, 0.5), (-1, 0.0, sigma + speed, False, 0.5)]
+        along = row[c.COURSE_EAST] * point[paths.P_D_EAST] + row[c.COURSE_NORTH] * point[paths.P_D_NORTH]
+        reverse = self.settings.reverse_prior
+        ways = [1 if along > 0 else -1] if abs(along) > 0.5 else [1, -1]
+        chosen = [(way, speed, sigma, True, (1.0 - reverse) / len(ways)) for way in ways]
+        if (
+            self.filter.at[State.ACCELEROMETER_BIAS] >= 0 or self.filter.signed
+        ):  # only these tell a train that is pushed
+            chosen += [(-way, -speed, sigma, True, reverse / len(ways)) for way in ways]
+        return chosen
+
+
+def _settings_for(model: TrackModel, settings: Settings) -> Settings:
+    """Fill in what the model says: the accuracy of its axis, and whether it has gradients."""
+    if settings.model_sigma == 0.0:
+        variance = 0.5 * (model.covariance_g[:, 0] + model.covariance_g[:, 3])
+        variance = variance[np.isfinite(variance)]
+        if len(variance):
+            settings = replace(settings, model_sigma=math.sqrt(float(np.median(variance))))
+    if not np.isfinite(model.height).any():
+        settings = replace(settings, accelerometer_walk=settings.accelerometer_walk + settings.gradient_walk)
+    return settings
+
+
+def _records(n: int, records: int) -> c.Records:
+    """Room for the smoother's records and the windows they refer to; none when nothing is to be kept."""
+    versions = 8 * SLOTS if records else 0
+    return c.Records(
+        np.empty((records, n)),
+        np.empty((records, n, n)),
+        np.empty((records, c.RECORD_SIZE)),
+        np.empty((versions, WINDOW), np.int64),
+        np.empty((versions, WINDOW), np.int64),
+        np.empty((versions, WINDOW)),
+        np.empty(versions, np.int64),
+        np.array([0, 0, int(records > 0)], np.int64),
+    )
+
+
+def _grown(records: c.Records) -> c.Records:
+    """Twice the room of records and windows, what is there kept."""
+
+    def double(array: NDArray[Any]) -> NDArray[Any]:
+        larger = np.empty((2 * len(array), *array.shape[1:]), array.dtype)
+        larger[: len(array)] = array
+        return larger
+
+    return c.Records(
+        double(records.x),
+        double(records.P_sqrt),
+        double(records.numbers),
+        double(records.track),
+        double(records.way),
+        double(records.begin),
+        double(records.tracks),
+        records.used,
+    )

@@ -1,0 +1,473 @@
+"""Measurement equations on track geometry and the rows they become (specification 19.3): SI, radians, no validation.
+
+Every row gives ln p of its reading, so that hypotheses can be compared (15.4).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from railnav.matching._kernels import (
+    AGREE_SINCE,
+    P_CANT,
+    P_CURVATURE,
+    P_D_EAST,
+    P_D_NORTH,
+    P_EAST,
+    P_GRADIENT,
+    P_GRADIENT_RATE,
+    P_NORTH,
+    POINT_SIZE,
+    SIGN,
+    SLIP_SINCE,
+    part,
+    path_point,
+)
+from railnav.navigation.columns import (
+    ACCELERATION,
+    ACCELEROMETER_BIAS,
+    BEND_CHANGE,
+    C_RING,
+    C_SCALE,
+    C_SIGMA_EAST,
+    C_SIGMA_NORTH,
+    C_SLIPS,
+    C_SPEED_STALE,
+    COURSE_EAST,
+    COURSE_NORTH,
+    DISTANCE,
+    EAST,
+    FORCE,
+    FORGET_WHEEL,
+    FRAME_EAST,
+    FRAME_NORTH,
+    GAUSS_HERMITE_NODES,
+    GAUSS_HERMITE_WEIGHTS,
+    GNSS_EAST,
+    GNSS_SPEED,
+    GYRO_BIAS,
+    K_CORRELATED,
+    K_COURSE_SIGMA,
+    K_CURVATURE_LENGTH,
+    K_CURVATURE_SHIFT,
+    K_CURVATURE_SIGMA,
+    K_GRAVITY,
+    K_GYRO_FLOOR,
+    K_GYRO_SCALE,
+    K_ODOMETER_SIGMA,
+    K_ODOMETER_SPEED,
+    K_SLIP_GATE,
+    K_SLIP_LONGEST,
+    K_SPEED_SHARE,
+    K_SPEED_SIGMA,
+    K_STILL_SIGMA,
+    K_WHITE,
+    KICK,
+    NORTH,
+    ODOMETER_SCALE,
+    POSITION,
+    RING,
+    ROW_GATE,
+    SHAKE_SPEED,
+    SIGMA_EAST,
+    SIGMA_NORTH,
+    SIGMA_SPEED,
+    SIGMA_WHEEL,
+    SIGMA_YAW,
+    SPEED,
+    SPEED_ERROR,
+    SPEED_LATENCY,
+    TIME,
+    TIME_TAG,
+    W_COLUMN,
+    W_F,
+    W_F_NORTH,
+    W_H,
+    W_H_NORTH,
+    W_KEEP,
+    W_MOVE,
+    WHEEL_DISTANCE,
+    WHEEL_SPAN,
+    WHEEL_SPEED,
+    YAW_RATE,
+)
+from railnav.navigation.dynamics._kernels import absorb, project, robust_row, variance_of, widen
+from railnav.units import RAIL_CENTRE_DISTANCE
+
+
+@njit(cache=True)
+def yaw_rate_kernel(speed, curvature, gradient, gradient_rate, cant):
+    """Rate about the down axis without Earth rate and bias: v (kappa cos(alpha) cos(phi) - kappa_v sin(phi))."""
+    cos_alpha = 1.0 / math.sqrt(1.0 + gradient * gradient)
+    sin_phi = cant / RAIL_CENTRE_DISTANCE
+    cos_phi = math.sqrt(1.0 - sin_phi * sin_phi)
+    kappa_v = gradient_rate * cos_alpha * cos_alpha
+    return speed * (curvature * cos_alpha * cos_phi - kappa_v * sin_phi)
+
+
+@njit(cache=True)
+def specific_force_kernel(speed, acceleration, curvature, gradient, gradient_rate, cant, gravity, out):
+    """Specific force, forward, right, down, of a vehicle that follows the track (19.3)."""
+    cos_alpha = 1.0 / math.sqrt(1.0 + gradient * gradient)
+    sin_alpha = gradient * cos_alpha
+    sin_phi = cant / RAIL_CENTRE_DISTANCE
+    cos_phi = math.sqrt(1.0 - sin_phi * sin_phi)
+    kappa_v = gradient_rate * cos_alpha * cos_alpha
+    side = speed * speed * curvature * cos_alpha
+    up = gravity * cos_alpha + speed * speed * kappa_v
+    out[0] = acceleration + gravity * sin_alpha
+    out[1] = side * cos_phi - up * sin_phi
+    out[2] = -(side * sin_phi + up * cos_phi)
+
+
+@part
+def gravity_pull(gravity, gradient):
+    """Gravity along the track, g sin(alpha)."""
+    return gravity * gradient / math.sqrt(1.0 + gradient * gradient)
+
+
+@part
+def antenna(point, lever, out):  # (POINT_SIZE,), (3,) -> out (4,): easting, northing, their derivatives along the path
+    """Where the antenna is: the axis point plus the lever arm turned by bearing, grade and cant; its derivative t + omega x lever."""
+    te, tn = point[P_D_EAST], point[P_D_NORTH]
+    sin_phi = point[P_CANT] / RAIL_CENTRE_DISTANCE
+    cos_phi = math.sqrt(1.0 - sin_phi * sin_phi)
+    right = lever[1] * cos_phi - lever[2] * sin_phi
+    forward = lever[0] + lever[2] * point[P_GRADIENT]  # a mast leans back uphill
+    out[0] = point[P_EAST] + forward * te + right * tn
+    out[1] = point[P_NORTH] + forward * tn - right * te
+    bend = point[P_CURVATURE]
+    along = 1.0 - right * bend
+    out[2] = along * te + forward * bend * tn
+    out[3] = along * tn - forward * bend * te
+
+
+@part
+def direction(fil, bank, h):
+    """Which way an unsigned speed or distance counts: by the estimate where that is certain, else as the hypothesis has it."""
+    if fil.signed == 1:
+        return 1.0
+    v = bank.x[h, fil.at[SPEED]]
+    if v * v > 9.0 * variance_of(bank.P_sqrt[h], fil.at[SPEED]):
+        bank.tags[h, SIGN] = 1 if v > 0.0 else -1
+    return float(bank.tags[h, SIGN])
+
+
+@part
+def ring_speed(ring, latest, time, distance):  # odometer readings, index after the last, s, m -> m/s, s
+    """Mean wheel speed over the last `WHEEL_SPAN`, and the span it really covers; 0 when readings do not reach back so far."""
+    for m in range(1, RING):
+        r = (latest - m) % RING
+        if not ring[r, 0] > -np.inf:
+            break
+        span = time - ring[r, 0]
+        if span >= WHEEL_SPAN - 1e-6:
+            return (distance - ring[r, 1]) / span, span
+    return 0.0, 0.0
+
+
+@part
+def wheel_row(fil, shared, bank, work, h, row):
+    """Odometer distance: a slipping wheel is forgotten until it agrees with the speed again. Gives ln p, slip and shake variances."""
+    at = fil.at
+    k = fil.settings
+    x, P_sqrt = bank.x[h], bank.P_sqrt[h]
+    h_row, f, keep, move = work.vector[W_H], work.vector[W_F], work.vector[W_KEEP], work.vector[W_MOVE]
+    column = work.vector[W_COLUMN]
+    i_d, i_v, i_a = at[WHEEL_DISTANCE], at[SPEED], at[ACCELERATION]
+    time, distance = row[TIME], row[DISTANCE]
+    variance = k[K_ODOMETER_SIGMA] ** 2
+    for j in range(x.shape[0]):
+        h_row[j] = 0.0
+    h_row[i_d] = 1.0
+    innovation = distance - x[i_d]
+    s = project(P_sqrt, h_row, f) + variance
+    wheel, span = ring_speed(shared.ring, int(shared.common[C_RING]), time, distance)
+    differs = False
+    agrees = False
+    if span > 0.0:
+        expected = (1.0 + x[at[ODOMETER_SCALE]]) * (x[i_v] - (0.5 * span * x[i_a] if i_a >= 0 else 0.0))
+        if fil.signed == 0:
+            expected = abs(expected)
+        # 0.15 m/s^2 for what the speed did within the span
+        sigma = math.sqrt(variance_of(P_sqrt, i_v) + 2.0 * variance / (span * span) + (0.15 * span) ** 2)
+        differs = abs(wheel - expected) > k[K_SLIP_GATE] * sigma
+        agrees = abs(wheel - expected) < 0.1 + 1.5 * sigma
+    shake = 0.0
+    info = bank.info[h]
+    if info[SLIP_SINCE] == -np.inf:
+        if abs(innovation) > k[K_SLIP_GATE] * math.sqrt(s) or differs:
+            info[SLIP_SINCE] = time
+            info[AGREE_SINCE] = np.inf
+            shared.common[C_SLIPS] += 1.0
+            shake = SHAKE_SPEED * SHAKE_SPEED  # what the slip has already done
+            widen(P_sqrt, i_v, SHAKE_SPEED, column)
+            if i_a >= 0:
+                widen(P_sqrt, i_a, KICK, column)
+    elif time - info[SLIP_SINCE] > k[K_SLIP_LONGEST]:  # then it is the speed that is wrong
+        info[SLIP_SINCE] = -np.inf
+        shake = (1.0 + abs(wheel - abs(x[i_v]))) ** 2
+        widen(P_sqrt, i_v, math.sqrt(shake), column)
+        if i_a >= 0:
+            widen(P_sqrt, i_a, KICK, column)
+    elif agrees:
+        info[AGREE_SINCE] = min(info[AGREE_SINCE], time)
+        if time - info[AGREE_SINCE] >= 1.0:
+            info[SLIP_SINCE] = -np.inf
+    else:
+        info[AGREE_SINCE] = np.inf
+    slip = 0.0
+    evidence = -0.5 * (innovation * innovation / s + math.log(s))
+    if info[SLIP_SINCE] > -np.inf:
+        slip = FORGET_WHEEL * FORGET_WHEEL
+        widen(P_sqrt, i_d, FORGET_WHEEL, column)
+        evidence = -0.5 * (ROW_GATE + math.log(variance))
+    project(P_sqrt, h_row, f)
+    absorb(x, P_sqrt, f, innovation, variance, keep, move)
+    return evidence, slip, shake
+
+
+@part
+def wheel_speed_row(fil, bank, work, h, row):
+    """Odometer speed, (1 + k) |v|."""
+    k = fil.settings
+    x = bank.x[h]
+    h_row = work.vector[W_H]
+    i_v, i_k = fil.at[SPEED], fil.at[ODOMETER_SCALE]
+    sigma = row[SIGMA_WHEEL] if row[SIGMA_WHEEL] > 0.0 else k[K_ODOMETER_SPEED]
+    sign = direction(fil, bank, h)
+    h_row[i_v] = sign * (1.0 + x[i_k])
+    h_row[i_k] = sign * x[i_v]
+    innovation = row[WHEEL_SPEED] - sign * (1.0 + x[i_k]) * x[i_v]
+    evidence = robust_row(
+        x, bank.P_sqrt[h], h_row, innovation, sigma * sigma, work.vector[W_F], work.vector[W_KEEP], work.vector[W_MOVE]
+    )
+    h_row[i_k] = 0.0
+    h_row[i_v] = 0.0
+    return evidence
+
+
+@part
+def gyro_row(fil, net, bank, work, h, row, dt):
+    """Yaw rate against curvature times speed, linearised statistically over the position's spread (five-point Gauss-Hermite)."""
+    k = fil.settings
+    x, P_sqrt = bank.x[h], bank.P_sqrt[h]
+    h_row, probe = work.vector[W_H], work.probe
+    i_v, i_s, i_g = fil.at[SPEED], fil.at[POSITION], fil.at[GYRO_BIAS]
+    v = x[i_v]
+    middle = x[i_s] - 0.5 * dt * v  # the mean since the epoch before belongs to the middle of the step
+    spread = variance_of(P_sqrt, i_s)
+    sd = math.sqrt(spread)
+    mean = 0.0
+    slope = 0.0
+    square = 0.0
+    for m in range(5):
+        path_point(net, bank, h, middle + GAUSS_HERMITE_NODES[m] * sd, probe)
+        bend = yaw_rate_kernel(1.0, probe[P_CURVATURE], probe[P_GRADIENT], probe[P_GRADIENT_RATE], probe[P_CANT])
+        mean += GAUSS_HERMITE_WEIGHTS[m] * bend
+        slope += GAUSS_HERMITE_WEIGHTS[m] * GAUSS_HERMITE_NODES[m] * bend
+        square += GAUSS_HERMITE_WEIGHTS[m] * bend * bend
+    slope /= sd
+    rest = max(square - mean * mean - slope * slope * spread, 0.0)
+    # errors of the model's curvature are the same over some length: count them once a length, not once a row
+    alike = max(1.0, k[K_CURVATURE_LENGTH] / max(abs(v) * dt, 0.1))
+    rough = (k[K_CURVATURE_SIGMA] ** 2 + (slope * k[K_CURVATURE_SHIFT]) ** 2) * alike
+    moving = min(1.0, abs(v) / 2.0)
+    variance = (
+        row[SIGMA_YAW] ** 2 + (moving * k[K_GYRO_FLOOR]) ** 2 + v * v * (rest + rough + (k[K_GYRO_SCALE] * mean) ** 2)
+    )
+    h_row[i_s] = v * slope
+    h_row[i_v] = mean
+    h_row[i_g] = 1.0
+    innovation = row[YAW_RATE] - v * mean - x[i_g]
+    evidence = robust_row(
+        x, P_sqrt, h_row, innovation, variance, work.vector[W_F], work.vector[W_KEEP], work.vector[W_MOVE]
+    )
+    h_row[i_s] = 0.0
+    h_row[i_v] = 0.0
+    h_row[i_g] = 0.0
+    return evidence
+
+
+@part
+def speed_rows(fil, bank, work, h, row):
+    """GNSS speed, |v - latency a| + error, and course, the velocity across the path as the antenna moves there."""
+    at = fil.at
+    k = fil.settings
+    x, P_sqrt = bank.x[h], bank.P_sqrt[h]
+    h_row, f, keep, move = work.vector[W_H], work.vector[W_F], work.vector[W_KEEP], work.vector[W_MOVE]
+    point = work.point[h]
+    i_v, i_s, i_l, i_e, i_a = at[SPEED], at[POSITION], at[SPEED_LATENCY], at[SPEED_ERROR], at[ACCELERATION]
+    speed = row[GNSS_SPEED]
+    course_east, course_north = row[COURSE_EAST], row[COURSE_NORTH]
+    stated = row[SIGMA_SPEED] > 0.0
+    sigma = row[SIGMA_SPEED] if stated else k[K_SPEED_SIGMA]
+    v = x[i_v]
+    if speed < 4.0 * sigma and abs(v) < 8.0 * sigma:  # near standstill the sign is not told
+        h_row[i_v] = 1.0
+        evidence = robust_row(x, P_sqrt, h_row, -v, speed * speed + sigma * sigma, f, keep, move)
+        h_row[i_v] = 0.0
+        return evidence
+    if course_east == course_east:
+        sign = 1.0 if course_east * point[P_D_EAST] + course_north * point[P_D_NORTH] > 0.0 else -1.0
+    elif fil.signed == 0:
+        sign = direction(fil, bank, h)
+    else:
+        sign = 1.0 if v >= 0.0 else -1.0
+    a = 0.0
+    if i_a >= 0:
+        a = x[i_a]
+        h_row[i_a] = -sign * x[i_l]
+    elif row[FORCE] == row[FORCE]:
+        a = row[FORCE] - x[at[ACCELEROMETER_BIAS]] - gravity_pull(k[K_GRAVITY], point[P_GRADIENT])
+    share = k[K_SPEED_SHARE] * sigma
+    h_row[i_v] = sign
+    h_row[i_l] = -sign * a
+    h_row[i_e] = share
+    innovation = speed - sign * (v - x[i_l] * a) - share * x[i_e]
+    evidence = robust_row(x, P_sqrt, h_row, innovation, sigma * sigma, f, keep, move)
+    h_row[i_v] = 0.0
+    h_row[i_l] = 0.0
+    h_row[i_e] = 0.0
+    if i_a >= 0:
+        h_row[i_a] = 0.0
+    if course_east == course_east and speed > 1.0 and abs(x[i_v]) > 1.0:
+        bend = point[P_CURVATURE]
+        step = x[i_s] - point[POINT_SIZE]
+        te = point[P_D_EAST] + step * bend * point[P_D_NORTH]
+        tn = point[P_D_NORTH] - step * bend * point[P_D_EAST]
+        across = sign * speed * (course_east * tn - course_north * te) / math.hypot(te, tn)
+        across -= sign * speed * bend * fil.lever[0]
+        floor = speed * k[K_COURSE_SIGMA] * (0.2 if stated else 3.0)
+        bent = 0.5 * speed * BEND_CHANGE * variance_of(P_sqrt, i_s)
+        h_row[i_s] = sign * speed * bend
+        variance = sigma * sigma + floor * floor + bent * bent
+        evidence += robust_row(x, P_sqrt, h_row, across, variance, f, keep, move)
+        h_row[i_s] = 0.0
+    return evidence
+
+
+@part
+def motion_rows(fil, net, shared, bank, work, h, row, dt, still):
+    """Odometer speed, standstill, yaw gyro, GNSS speed and course of one hypothesis, where they are there; gives ln p."""
+    at = fil.at
+    h_row = work.vector[W_H]
+    for j in range(h_row.shape[0]):
+        h_row[j] = 0.0
+    evidence = 0.0
+    if row[WHEEL_SPEED] == row[WHEEL_SPEED] and at[ODOMETER_SCALE] >= 0:
+        evidence += wheel_speed_row(fil, bank, work, h, row)
+    if still:
+        i_v = at[SPEED]
+        h_row[i_v] = 1.0
+        variance = fil.settings[K_STILL_SIGMA] ** 2
+        evidence += robust_row(
+            bank.x[h],
+            bank.P_sqrt[h],
+            h_row,
+            -bank.x[h, i_v],
+            variance,
+            work.vector[W_F],
+            work.vector[W_KEEP],
+            work.vector[W_MOVE],
+        )
+        h_row[i_v] = 0.0
+    if row[YAW_RATE] == row[YAW_RATE] and at[GYRO_BIAS] >= 0 and dt > 0.0:
+        evidence += gyro_row(fil, net, bank, work, h, row, dt)
+    if row[GNSS_SPEED] == row[GNSS_SPEED] and at[SPEED_LATENCY] >= 0 and shared.common[C_SPEED_STALE] == 0.0:
+        evidence += speed_rows(fil, bank, work, h, row)
+    return evidence
+
+
+@part
+def position_row(fil, net, shared, bank, work, h, row):
+    """Rows of a GNSS fix, c(s + v tag) + lever + sigma b + frame, and its innovation; gives NIS and ln det S.
+
+    `work` then holds rows, projections, innovation, white variances and the covariance S. A spread over which the path bends is
+    linearised statistically (five-point Gauss-Hermite), else at the estimate.
+    """
+    at = fil.at
+    k = fil.settings
+    x, P_sqrt = bank.x[h], bank.P_sqrt[h]
+    h_east, h_north = work.vector[W_H], work.vector[W_H_NORTH]
+    f_east, f_north = work.vector[W_F], work.vector[W_F_NORTH]
+    point, probe, place, fix = work.point[h], work.probe, work.place, work.fix
+    i_s, i_v, i_g, i_t = at[POSITION], at[SPEED], at[GNSS_EAST], at[TIME_TAG]
+    i_fe, i_fn = at[FRAME_EAST], at[FRAME_NORTH]
+    n = x.shape[0]
+    for j in range(n):
+        h_east[j] = 0.0
+        h_north[j] = 0.0
+    spread = variance_of(P_sqrt, i_s)
+    extra_east = 0.0
+    extra_north = 0.0
+    seen = x[i_s] + x[i_v] * x[i_t]  # where the fix shows the train
+    step = seen - point[POINT_SIZE]
+    if abs(point[P_CURVATURE]) * spread > 0.1 or spread > 400.0:
+        sd = math.sqrt(spread)
+        mean_e = 0.0
+        mean_n = 0.0
+        slope_e = 0.0
+        slope_n = 0.0
+        base_e = 0.0
+        base_n = 0.0
+        for m in range(5):
+            path_point(net, bank, h, seen + GAUSS_HERMITE_NODES[m] * sd, probe)
+            antenna(probe, fil.lever, place)
+            w = GAUSS_HERMITE_WEIGHTS[m]
+            if m == 0:
+                base_e = place[0]
+                base_n = place[1]
+            mean_e += w * (place[0] - base_e)
+            mean_n += w * (place[1] - base_n)
+            slope_e += w * GAUSS_HERMITE_NODES[m] * (place[0] - base_e)
+            slope_n += w * GAUSS_HERMITE_NODES[m] * (place[1] - base_n)
+            extra_east += w * (place[0] - base_e) ** 2
+            extra_north += w * (place[1] - base_n) ** 2
+        extra_east = max(extra_east - mean_e * mean_e - slope_e * slope_e, 0.0)
+        extra_north = max(extra_north - mean_n * mean_n - slope_n * slope_n, 0.0)
+        h_east[i_s] = slope_e / sd
+        h_north[i_s] = slope_n / sd
+        at_east = base_e + mean_e
+        at_north = base_n + mean_n
+    elif abs(step) > 2.0:
+        path_point(net, bank, h, seen, probe)
+        antenna(probe, fil.lever, place)
+        h_east[i_s] = place[2]
+        h_north[i_s] = place[3]
+        at_east = place[0]
+        at_north = place[1]
+    else:
+        antenna(point, fil.lever, place)
+        sagitta = 0.5 * step * step * point[P_CURVATURE]
+        h_east[i_s] = place[2]
+        h_north[i_s] = place[3]
+        at_east = place[0] + step * place[2] + sagitta * place[3]
+        at_north = place[1] + step * place[3] - sagitta * place[2]
+    h_east[i_t] = x[i_v] * h_east[i_s]
+    h_north[i_t] = x[i_v] * h_north[i_s]
+    h_east[i_v] = x[i_t] * h_east[i_s]
+    h_north[i_v] = x[i_t] * h_north[i_s]
+    scale = shared.common[C_SCALE] * k[K_CORRELATED]
+    h_east[i_g] = scale * shared.common[C_SIGMA_EAST]
+    h_north[i_g + 1] = scale * shared.common[C_SIGMA_NORTH]
+    h_east[i_fe] = 1.0
+    h_north[i_fn] = 1.0
+    fix[0] = row[EAST] - at_east - h_east[i_g] * x[i_g] - x[i_fe]
+    fix[1] = row[NORTH] - at_north - h_north[i_g + 1] * x[i_g + 1] - x[i_fn]
+    fix[2] = (k[K_WHITE] * row[SIGMA_EAST]) ** 2 + extra_east
+    fix[3] = (k[K_WHITE] * row[SIGMA_NORTH]) ** 2 + extra_north
+    s_ee = project(P_sqrt, h_east, f_east) + fix[2]
+    s_nn = project(P_sqrt, h_north, f_north) + fix[3]
+    s_en = 0.0
+    for j in range(n):
+        s_en += f_east[j] * f_north[j]
+    fix[4] = s_ee
+    fix[5] = s_nn
+    fix[6] = s_en
+    det = s_ee * s_nn - s_en * s_en
+    nis = (fix[0] * fix[0] * s_nn - 2.0 * fix[0] * fix[1] * s_en + fix[1] * fix[1] * s_ee) / det
+    return nis, math.log(det)
