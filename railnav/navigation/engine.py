@@ -14,6 +14,7 @@ from railnav.matching.candidates import starting_candidates
 from railnav.matching.network import pack_network
 from railnav.navigation import _kernels as kernel
 from railnav.navigation import columns as c
+from railnav.navigation.epochs import kernel_table
 from railnav.navigation.integrity import normal_quantile
 from railnav.navigation.state import Settings, State, layout
 
@@ -39,7 +40,7 @@ class Engine:
         Room for the smoother's records, to begin with; 0 keeps none.
     """
 
-    __slots__ = ("bank", "filter", "model", "network", "records", "settings", "shared", "work")
+    __slots__ = ("bank", "filter", "latitude", "model", "network", "records", "settings", "shared", "work")
 
     def __init__(
         self,
@@ -61,6 +62,8 @@ class Engine:
         self.model = model
         self.settings = _settings_for(model, settings)
         self.network = pack_network(model)
+        middle, _, _ = model.frame.to_geodetic(model.easting[[0, -1]].mean(), model.northing[[0, -1]].mean(), None)
+        self.latitude = float(middle)
         at = layout(imu=imu, odometer=odometer, speed=speed)
         n = int(at.max()) + 1
         self.filter = c.Filter(
@@ -122,6 +125,10 @@ class Engine:
                 self.records = _grown(self.records)
             else:
                 self._start(table[first])
+
+    def table(self, raw: FloatArray) -> FloatArray:
+        """Raw epochs as the loop reads them; see `railnav.navigation.epochs.kernel_table`."""
+        return kernel_table(raw, self.model.frame, self.latitude)
 
     def living(self) -> list[int]:
         """Slots of the living hypotheses."""

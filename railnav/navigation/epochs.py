@@ -5,17 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from railnav.errors import RunError
-from railnav.navigation import columns as kernel
+from railnav.geodesy.grid import GridFrame
+from railnav.navigation import columns as c
 from railnav.run import ImuStream, OdometerStream, Run
-
-if TYPE_CHECKING:
-    from railnav.track.model import TrackModel
 
 FloatArray = NDArray[np.float64]
 NAN = math.nan
@@ -79,6 +76,22 @@ class Epoch:
 
 #: Columns of the raw table of epochs: the fields of `Epoch`.
 COLUMNS = tuple(Epoch.__slots__)
+_AT = {name: i for i, name in enumerate(COLUMNS)}
+#: Columns that the kernels read as they come.
+_PLAIN = tuple(
+    (_AT[name], target)
+    for name, target in (
+        ("time", c.TIME),
+        ("speed", c.GNSS_SPEED),
+        ("sigma_speed", c.SIGMA_SPEED),
+        ("distance", c.DISTANCE),
+        ("wheel_speed", c.WHEEL_SPEED),
+        ("sigma_wheel_speed", c.SIGMA_WHEEL),
+        ("forward_force", c.FORCE),
+        ("yaw_rate", c.YAW_RATE),
+        ("sigma_yaw_rate", c.SIGMA_YAW),
+    )
+)
 
 
 def epochs(run: Run) -> Iterator[Epoch]:
@@ -122,13 +135,12 @@ def raw_table(run: Run) -> FloatArray:
     time = time[np.append(True, np.diff(time) > SAME_TIME)]
     time = _filled(time, imu)
     table = np.full((len(time), len(COLUMNS)), np.nan)
-    column = {name: i for i, name in enumerate(COLUMNS)}
-    table[:, column["time"]] = time
+    table[:, _AT["time"]] = time
     rows = _rows(time, gnss.time)
     for name in ("latitude", "longitude", "sigma_east", "sigma_north", "hdop", "speed", "course", "sigma_speed"):
         value = getattr(gnss, name)
         if value is not None:
-            table[rows, column[name]] = value
+            table[rows, _AT[name]] = value
     if odometer is not None and len(wheel):
         rows = _rows(time, odometer.time[wheel])
         for name, value in (
@@ -137,68 +149,57 @@ def raw_table(run: Run) -> FloatArray:
             ("sigma_wheel_speed", odometer.sigma_speed if odometer.distance is None else None),
         ):
             if value is not None:
-                table[rows, column[name]] = value[wheel]
+                table[rows, _AT[name]] = value[wheel]
     if imu is not None and len(imu):
         force, rate, sigma = _inertial_means(imu, time)
-        table[:, column["forward_force"]] = force
-        table[:, column["yaw_rate"]] = rate
-        table[:, column["sigma_yaw_rate"]] = sigma
+        table[:, _AT["forward_force"]] = force
+        table[:, _AT["yaw_rate"]] = rate
+        table[:, _AT["sigma_yaw_rate"]] = sigma
     return table
 
 
-def kernel_table(raw: FloatArray, model: TrackModel) -> FloatArray:
+def kernel_table(raw: FloatArray, frame: GridFrame, latitude: float) -> FloatArray:
     """Epochs as the kernels read them: fixes in the model's plane, courses from grid north, Earth rate taken off the gyro.
 
     Parameters
     ----------
     raw : (m, 15) array
         As `raw_table` gives it.
-    model : TrackModel
+    frame : GridFrame
+        The model's plane.
+    latitude : float
+        Of the middle of the model, rad: the vehicle is level to within cant and gradient, and the Earth's rate about its down
+        axis is -Omega sin(latitude).
 
     Returns
     -------
     (m, 15) array
-        Columns as in `railnav.navigation._kernels`.
+        Columns as in `railnav.navigation.columns`.
     """
-    column = {name: i for i, name in enumerate(COLUMNS)}
-    table = np.full((len(raw), kernel.EPOCH_SIZE), np.nan)
-    table[:, kernel.TIME] = raw[:, column["time"]]
-    rows = np.flatnonzero(np.isfinite(raw[:, column["latitude"]]))
-    if len(rows):
-        easting, northing, _ = model.frame.to_grid(raw[rows, column["latitude"]], raw[rows, column["longitude"]], None)
-        table[rows, kernel.EAST] = easting
-        table[rows, kernel.NORTH] = northing
-        hdop = raw[rows, column["hdop"]]
-        unstated = np.where(np.isfinite(hdop), SIGMA_PER_HDOP * hdop, UNSTATED_SIGMA)
-        for name, target in (("sigma_east", kernel.SIGMA_EAST), ("sigma_north", kernel.SIGMA_NORTH)):
-            sigma = raw[rows, column[name]]
-            table[rows, target] = np.where(np.isfinite(sigma), sigma, unstated)
-        course = raw[rows, column["course"]]
-        if np.isfinite(course).any():
-            bearing = course - model.frame.convergence(easting, northing)
-            table[rows, kernel.COURSE_EAST] = np.sin(bearing)
-            table[rows, kernel.COURSE_NORTH] = np.cos(bearing)
-    for name, target in (
-        ("speed", kernel.GNSS_SPEED),
-        ("sigma_speed", kernel.SIGMA_SPEED),
-        ("distance", kernel.DISTANCE),
-        ("wheel_speed", kernel.WHEEL_SPEED),
-        ("sigma_wheel_speed", kernel.SIGMA_WHEEL),
-        ("forward_force", kernel.FORCE),
-    ):
-        table[:, target] = raw[:, column[name]]
-    # the vehicle is level to within cant and gradient: the Earth's rate about its down axis is -Omega sin(latitude)
-    table[:, kernel.YAW_RATE] = raw[:, column["yaw_rate"]] + EARTH_RATE * math.sin(model_latitude(model))
-    sigma = raw[:, column["sigma_yaw_rate"]]
-    table[:, kernel.SIGMA_YAW] = np.where(np.isfinite(sigma), sigma, UNSTATED_SIGMA_YAW)
+    table = np.full((len(raw), c.EPOCH_SIZE), np.nan)
+    for source, target in _PLAIN:
+        table[:, target] = raw[:, source]
+    table[:, c.YAW_RATE] += EARTH_RATE * math.sin(latitude)
+    sigma = table[:, c.SIGMA_YAW]
+    table[:, c.SIGMA_YAW] = np.where(np.isfinite(sigma), sigma, UNSTATED_SIGMA_YAW)
+    rows = np.flatnonzero(np.isfinite(raw[:, _AT["latitude"]]))
+    if len(rows) == 0:
+        return table
+    fixes = raw[rows]
+    easting, northing, _ = frame.to_grid(fixes[:, _AT["latitude"]], fixes[:, _AT["longitude"]], None)
+    table[rows, c.EAST] = easting
+    table[rows, c.NORTH] = northing
+    hdop = fixes[:, _AT["hdop"]]
+    unstated = np.where(np.isfinite(hdop), SIGMA_PER_HDOP * hdop, UNSTATED_SIGMA)
+    for name, target in (("sigma_east", c.SIGMA_EAST), ("sigma_north", c.SIGMA_NORTH)):
+        sigma = fixes[:, _AT[name]]
+        table[rows, target] = np.where(np.isfinite(sigma), sigma, unstated)
+    course = fixes[:, _AT["course"]]
+    if np.isfinite(course).any():
+        bearing = course - frame.convergence(easting, northing)
+        table[rows, c.COURSE_EAST] = np.sin(bearing)
+        table[rows, c.COURSE_NORTH] = np.cos(bearing)
     return table
-
-
-def model_latitude(model: TrackModel) -> float:
-    """Latitude of the middle of a model's first and last knots, rad."""
-    ends = [0, -1]
-    latitude, _, _ = model.frame.to_geodetic(model.easting[ends].mean(), model.northing[ends].mean(), None)
-    return float(latitude)
 
 
 def _chosen_readings(odometer: OdometerStream | None) -> NDArray[np.int64]:

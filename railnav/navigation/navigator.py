@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from railnav.errors import RunError
 from railnav.navigation import columns as c
 from railnav.navigation.engine import Engine
-from railnav.navigation.epochs import COLUMNS, IDLE_STEP, Epoch, kernel_table
+from railnav.navigation.epochs import COLUMNS, IDLE_STEP, Epoch
 from railnav.navigation.solution import Mode
 from railnav.navigation.state import Settings
 
@@ -190,7 +190,7 @@ class Navigator:
             )
         for i, name in enumerate(COLUMNS):
             self._raw[0, i] = getattr(epoch, name)
-        table = kernel_table(self._raw, self.model)
+        table = self._engine.table(self._raw)
         out = self._row
         if 1.5 * IDLE_STEP < epoch.time - before < math.inf:
             steps = math.ceil((epoch.time - before) / IDLE_STEP - 1e-6)

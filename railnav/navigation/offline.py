@@ -13,7 +13,7 @@ from railnav.errors import OffModelError
 from railnav.matching import _kernels as paths
 from railnav.navigation import columns as c
 from railnav.navigation.engine import SLOTS, Engine
-from railnav.navigation.epochs import kernel_table, raw_table
+from railnav.navigation.epochs import raw_table
 from railnav.navigation.smoothing import smooth_rows
 from railnav.navigation.solution import Mode, Solution
 from railnav.navigation.state import Settings
@@ -86,11 +86,10 @@ def navigate(
     True
     """
     raw = raw_table(run)
-    table = kernel_table(raw, model)
     gnss, odometer, imu = run.gnss, run.odometer, run.imu
     assert gnss is not None
     reads = "" if odometer is None or len(odometer) == 0 else "speed" if odometer.distance is None else "distance"
-    m = len(table)
+    m = len(raw)
     engine = Engine(
         model,
         settings or Settings.of_receiver(gnss.receiver),
@@ -102,6 +101,7 @@ def navigate(
         integrity_risk=integrity_risk,
         records=2 * m + 2 * SLOTS if smooth else 0,
     )
+    table = engine.table(raw)
     out = np.empty((m, c.OUTPUT_SIZE))
     stride = m if progress is None else max(2000, m // 50)
     for done in range(0, m, stride):
