@@ -7,7 +7,7 @@ Units are turned into SI and radians here, and nowhere else. What a stream's col
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from railnav.errors import CrsError, RunError
 from railnav.io.atomic import atomic_folder
-from railnav.io.tables import Column, Table, Words, freeze, read_table, write_table
+from railnav.io.gnss_log import LOG_FORMATS, LogSummary, read_log
+from railnav.io.tables import Column, Table, Words, check_table, freeze, read_table, write_table
 from railnav.run import BaliseStream, GaugeStream, GnssStream, GyroAnglesStream, ImuStream, OdometerStream, Run
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ FloatArray = NDArray[np.float64]
 
 #: The table of contents of a run folder.
 CONTENTS = "run.toml"
-#: Formats of streams that are read.
+#: Formats of tables, for every stream; a GNSS stream may also be a receiver's log.
 FORMATS = ("csv", "parquet")
 #: A run.toml larger than this is refused.
 MAX_CONTENTS_BYTES = 1_000_000
@@ -106,13 +107,17 @@ _COLUMNS: dict[str, tuple[Column, ...]] = {
 }
 
 
-def read_run(folder: str | Path) -> Run:
+def read_run(folder: str | Path, *, report: Callable[[LogSummary], None] | None = None) -> Run:
     r"""Read a run folder: `run.toml` and the streams it names.
 
     Parameters
     ----------
     folder : path
-        Folder of one drive. Streams are CSV or Parquet, by the ending of their file.
+        Folder of one drive. Streams are CSV or Parquet, by the ending of their file; the GNSS stream may be a receiver's log
+        (NMEA 0183 and others, see `railnav.io.gnss_log.LOG_FORMATS`).
+    report : callable, optional
+        Called with the summary of each log: what was read, what was left out and why. Without it, a summary that is not clean is
+        still logged as a warning to "railnav.io".
 
     Returns
     -------
@@ -125,7 +130,7 @@ def read_run(folder: str | Path) -> Run:
     RunError
         run.toml or a stream is missing, malformed or empty; a required column is missing; a value is not finite where one
         is needed or outside its lawful range; sigma is not positive; time stands still or runs backwards; a file lies
-        outside the folder; a format is not read yet.
+        outside the folder; a format is unknown; a log is refused by `railnav.io.gnss_log.read_log`.
 
     Notes
     -----
@@ -150,8 +155,17 @@ def read_run(folder: str | Path) -> Run:
     tables: dict[str, Table] = {}
     for name in STREAMS:
         stream: _Stream | None = getattr(contents, name)
-        if stream is not None:
-            tables[name] = read_table(_stream_file(folder, name, stream), _COLUMNS[name], error=RunError)
+        if stream is None:
+            continue
+        path = _stream_file(folder, name, stream)
+        if stream.format in FORMATS:
+            tables[name] = read_table(path, _COLUMNS[name], error=RunError)
+            continue
+        log = read_log(path, stream.format, start=start)
+        check_table(log.table, _COLUMNS[name])
+        tables[name] = log.table
+        if report is not None:
+            report(log.summary)
     if not tables:
         cause = f"names no stream; a stream is one of {', '.join(STREAMS)}"
         raise RunError(cause, file=file, remedy='add for instance [gnss] with file = "gnss.csv"')
@@ -281,8 +295,9 @@ def _start(start: object, file: Path) -> datetime:
 
 def _stream_file(folder: Path, name: str, stream: _Stream) -> Path:
     contents, column = folder / CONTENTS, f"{name}.file"
-    if stream.format not in FORMATS:
-        cause = f"{stream.format[:40]!r} is a format that is not read yet; csv and parquet are"
+    formats = (*FORMATS, *LOG_FORMATS) if name == "gnss" else FORMATS
+    if stream.format not in formats:
+        cause = f"{stream.format[:40]!r} is no format that is read here; {', '.join(formats)} are"
         remedy = "convert the stream to CSV with the columns of formats.md"
         raise RunError(cause, file=contents, column=f"{name}.format", remedy=remedy)
     path = Path(stream.file)

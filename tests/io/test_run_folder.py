@@ -201,7 +201,7 @@ def test_all_real_runs_read(shared_data):
     assert len(run.imu) == 83429
     assert len(run.odometer) == 8343
     assert abs(run.imu.specific_force[:, 2].mean() + 9.81) < 0.1
-    with pytest.raises(RunError, match="'rtklib-pos' is a format that is not read yet"):
+    with pytest.raises(RunError, match="'rtklib-pos' is no format that is read here"):
         read_run(shared_data / "gnss_imu_drive")
 
 
@@ -427,8 +427,12 @@ CONTENTS = {
     "absent": (HEAD + '[gnss]\nfile = "gone.csv"\n', "gone.csv: does not exist; check the name"),
     "folder": (HEAD + '[gnss]\nfile = "."\n', "is a folder; name the file in it"),
     "format": (
-        HEAD + '[gnss]\nfile = "a.ubx"\nformat = "ubx"\n',
-        "run.toml, column gnss.format: 'ubx' is a format that is not read yet; csv and parquet are; convert the stream to CSV",
+        HEAD + '[gnss]\nfile = "a.bin"\nformat = "sirf"\n',
+        "run.toml, column gnss.format: 'sirf' is no format that is read here; csv, parquet, nmea",
+    ),
+    "format of another stream": (
+        HEAD + '[imu]\nfile = "a.nmea"\nformat = "nmea"\n',
+        "run.toml, column imu.format: 'nmea' is no format that is read here; csv, parquet are; convert the stream to CSV",
     ),
     "no TOML": ("[run\nid = 3", "run.toml: is no TOML ("),
     "nested": ("a = " + "[" * 5000, "run.toml: is no TOML ("),

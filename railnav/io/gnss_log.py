@@ -1,0 +1,341 @@
+"""What the readers of GNSS logs have in common: reading by blocks, the summary of what was left out, one row an instant.
+
+A log is a receiver's own file. Unlike a table, it may be damaged in places: what a checksum or its syntax condemns is counted,
+left out and said in the `LogSummary`; where too much is damaged, or nothing is left, the log is refused.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railnav.errors import RunError
+from railnav.io import gnss_time
+from railnav.io.tables import Table, _check_file, freeze
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+ByteArray = NDArray[np.uint8]
+
+#: Formats of GNSS logs, as run.toml names them.
+LOG_FORMATS = ("nmea",)
+#: A log with more than one broken row, and a larger share of them, is refused.
+MAX_BROKEN_SHARE = 0.1
+#: Bytes read at a time.
+BLOCK = 1 << 21
+
+#: Columns of a log, in the units of the table of formats; the kernels write them in this order.
+COLUMNS = (
+    "latitude_deg",
+    "longitude_deg",
+    "height_m",
+    "sigma_east_m",
+    "sigma_north_m",
+    "sigma_up_m",
+    "speed_m_s",
+    "course_deg",
+    "sigma_speed_m_s",
+    "quality",
+    "satellites",
+    "hdop",
+)
+
+_logger = logging.getLogger("railnav.io")
+
+
+@dataclass(frozen=True, slots=True)
+class LogSummary:
+    """What a log held, and what of it was left out.
+
+    Attributes
+    ----------
+    file : path
+        The log.
+    format : str
+        As run.toml names it.
+    unit : str
+        What is counted: sentences, rows, messages or points.
+    fixes : int
+        Instants with a position: the rows of the stream.
+    good : int
+        Sentences, rows, messages or points that were read, those included that carry nothing used here.
+    broken : int
+        Those left out because their checksum or their syntax is wrong.
+    first_broken : int or None
+        Where the first of them is: row as an editor counts it, byte offset in a binary file.
+    void : int
+        Instants at which the receiver says that it has no fix; left out.
+    duplicates : int
+        Second fixes at one instant; the better was kept.
+    counts : mapping of str to int
+        How many of each kind.
+    notes : tuple of str
+        What else a user should know, one sentence each.
+    """
+
+    file: Path
+    format: str
+    unit: str
+    fixes: int
+    good: int
+    broken: int = 0
+    first_broken: int | None = None
+    void: int = 0
+    duplicates: int = 0
+    counts: Mapping[str, int] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def suspicious(self) -> bool:
+        """Whether something was damaged, doubtful or put right."""
+        return bool(self.broken or self.notes)
+
+    def __str__(self) -> str:
+        parts = [f"{self.fixes} fixes from {self.good} {self.unit}"]
+        if self.broken:
+            where = "byte" if self.format == "ubx" else "row"
+            parts.append(f"{self.broken} broken {self.unit} left out (the first at {where} {self.first_broken})")
+        if self.void:
+            parts.append(f"{self.void} instants without a fix left out")
+        if self.duplicates:
+            parts.append(f"{self.duplicates} second fixes at one instant left out")
+        return f"{self.file}: {'; '.join([*parts, *self.notes])}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GnssLog:
+    """A log on the run's clock.
+
+    Attributes
+    ----------
+    table : Table
+        `time_s` and the columns of the `gnss` stream that the log carries, one row an instant; NaN where it says nothing.
+    summary : LogSummary
+        What was left out.
+    """
+
+    table: Table
+    summary: LogSummary
+
+
+@dataclass(slots=True)
+class Found:
+    """What a reader collects on its way through a log; `settle` turns it into a GnssLog.
+
+    `stamp` is in ns since 1970, on GPS time where `gps_time`, else UTC. `better` ranks fixes of one instant.
+    """
+
+    file: Path
+    format: str
+    unit: str
+    stamp: IntArray
+    number: dict[str, FloatArray]
+    row: IntArray
+    better: FloatArray
+    gps_time: bool = False
+    good: int = 0
+    broken: int = 0
+    first_broken: int | None = None
+    void: int = 0
+    duplicates: int = 0
+    counts: Mapping[str, int] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+def read_log(path: str | Path, format: str, *, start: datetime) -> GnssLog:  # noqa: A002 - the key in run.toml
+    """Read a GNSS log onto the run's clock.
+
+    Parameters
+    ----------
+    path : path
+        The log.
+    format : str
+        "nmea", "rtklib-pos", "ubx" or "gpx".
+    start : datetime
+        Start of the run, with its time zone; times count from here.
+
+    Returns
+    -------
+    GnssLog
+        The stream's columns and the summary of what was left out.
+
+    Raises
+    ------
+    RunError
+        The file is missing or holds no fix; more than a tenth of it is broken; time runs backwards; its first fix is more than
+        7 days from `start`.
+
+    Notes
+    -----
+    The log is read in blocks of 2 MB: memory grows with the fixes kept, about 120 bytes each, not with the file. A log that is
+    displaced by whole roll-overs of 1,024 GPS weeks (a receiver with old firmware) is put right when it then starts within a
+    day of `start`, and a note says so. Summaries that are not clean are also logged as a warning to "railnav.io".
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from datetime import UTC
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = Path(folder, "a.nmea").write_text(
+    ...         "$GPGGA,172814.0,3723.46587704,N,12202.26957864,W,2,6,1.2,18.893,M,-25.669,M,2.0,0031*4F")
+    ...     log = read_log(f"{folder}/a.nmea", "nmea", start=datetime(2026, 5, 4, 17, 28, tzinfo=UTC))
+    >>> log.table.number["time_s"].tolist(), log.table.number["height_m"].round(3).tolist()
+    ([14.0], [-6.776])
+    """
+    path = Path(path)
+    _check_file(path, RunError)
+    scan = _reader(path, format)
+    origin = gnss_time.nanoseconds(start)
+    try:
+        found = scan(path, origin)
+    except OSError as error:
+        raise RunError(f"cannot be read ({error.strerror or error})", file=path) from error
+    log = settle(found, origin)
+    if log.summary.suspicious:
+        _logger.warning("%s", log.summary)
+    return log
+
+
+def _reader(path: Path, format: str) -> Callable[[Path, int], Found]:  # noqa: A002
+    """Choose the reader; numba is not loaded for the others."""
+    if format == "nmea":
+        from railnav.io.nmea import scan
+    else:
+        raise RunError(f"{format[:40]!r} is no format of GNSS logs; {', '.join(LOG_FORMATS)} are", file=path)
+    return scan
+
+
+def settle(found: Found, start: int) -> GnssLog:
+    """Put what a reader found on the run's clock (`start` in ns since 1970), one row an instant, or refuse it."""
+    file, where = found.file, f"the first at {'byte' if found.format == 'ubx' else 'row'} {found.first_broken}"
+    if found.broken > max(1.0, MAX_BROKEN_SHARE * (found.good + found.broken)):  # the last may be torn
+        cause = f"{found.broken} of {found.good + found.broken} {found.unit} are broken ({where})"
+        remedy = (
+            "copy the log again from the receiver" if found.good else f"is this a log in the format {found.format}?"
+        )
+        raise RunError(cause, file=file, remedy=remedy)
+    if not len(found.stamp):
+        held = ", ".join(f"{count} {kind}" for kind, count in found.counts.items() if count) or f"no {found.unit}"
+        cause = f"holds no fix ({found.void} instants without one; {held})"
+        raise RunError(cause, file=file, remedy="leave the stream out, or name the right format")
+    stamp = found.stamp
+    shift = gnss_time.roll_overs(int(stamp[0]), start)
+    if shift:
+        before = gnss_time.calendar(int(stamp[0]))
+        stamp = stamp + shift * gnss_time.ROLL_OVER
+        weeks = f"{shift * 1024:+d} weeks"
+        found.notes.append(f"its dates ({before}) are displaced by a GPS week roll-over and were moved by {weeks}")
+    if found.gps_time:
+        stamp = gnss_time.gps_to_utc(stamp)
+    if abs(int(stamp[0]) - start) > gnss_time.MAX_FROM_START:
+        cause = (
+            f"the first fix is of {gnss_time.calendar(int(stamp[0]))}, the run starts at {gnss_time.calendar(start)}"
+        )
+        raise RunError(cause, file=file, row=_row(found, 0), remedy="correct run.start, or look for a log of this run")
+    back = np.flatnonzero(stamp[1:] < stamp[:-1])
+    if len(back):
+        index = int(back[0]) + 1
+        before, now = (gnss_time.calendar(int(stamp[i])) for i in (index - 1, index))
+        cause = f"time runs backwards ({now} after {before})"
+        raise RunError(cause, file=file, row=_row(found, index), remedy="split the log where the clock was set back")
+    keep = _best(stamp, found.better)
+    duplicates = found.duplicates + len(stamp) - len(keep)
+    number = {"time_s": freeze((stamp[keep] - start) / gnss_time.SECOND)}
+    for name in list(found.number):
+        values = found.number.pop(name)
+        if not np.isnan(values).all():
+            number[name] = freeze(values if len(keep) == len(stamp) else values[keep])
+    row = found.row[keep]
+    summary = LogSummary(
+        file=file,
+        format=found.format,
+        unit=found.unit,
+        fixes=len(keep),
+        good=found.good,
+        broken=found.broken,
+        first_broken=found.first_broken,
+        void=found.void,
+        duplicates=duplicates,
+        counts={kind: count for kind, count in found.counts.items() if count},
+        notes=tuple(found.notes),
+    )
+    return GnssLog(Table(file, len(keep), number, error=RunError, row_of=lambda index: int(row[index])), summary)
+
+
+def _row(found: Found, index: int) -> int | None:
+    return None if found.format == "ubx" else int(found.row[index])
+
+
+def _best(stamp: IntArray, better: FloatArray) -> IntArray:
+    """Indices of one row an instant: the best, the first of equals. Stamps do not fall."""
+    new = np.concatenate([[True], stamp[1:] > stamp[:-1]])
+    if new.all():
+        return np.arange(len(stamp))
+    group = np.cumsum(new)
+    order = np.lexsort((np.arange(len(stamp)), -better, group))
+    first = np.concatenate([[True], group[order][1:] != group[order][:-1]])
+    return np.asarray(order[first], dtype=np.int64)
+
+
+def rank(
+    quality: FloatArray, satellites: FloatArray | None, hdop: FloatArray | None, order: Mapping[int, int]
+) -> FloatArray:
+    """Order fixes of one instant: by kind of fix (`order` of the quality), then satellites, then smaller HDOP."""
+    better = np.zeros(len(quality))
+    for value, place in order.items():
+        better[quality == value] = place * 1e6
+    if satellites is not None:
+        better += 1e3 * np.clip(np.nan_to_num(satellites), 0, 999)
+    if hdop is not None:
+        better -= np.clip(np.nan_to_num(hdop, nan=99.0), 0, 99)
+    return better
+
+
+class Gathered:
+    """Columns that grow block by block; a column that stays empty costs nothing."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self.names = tuple(names)
+        self.pieces: list[list[NDArray[Any] | int]] = [[] for _ in self.names]
+
+    def add(self, rows: NDArray[Any]) -> None:
+        """Keep a copy of rows (k, columns)."""
+        for piece, column in zip(self.pieces, rows.T, strict=True):
+            empty = rows.dtype.kind == "f" and bool(np.isnan(column).all())
+            piece.append(len(column) if empty else column.copy())
+
+    def take(self, name: str) -> NDArray[Any] | None:
+        """Give a whole column and let go of its pieces; None where it holds nothing."""
+        place = self.names.index(name)
+        piece, self.pieces[place] = self.pieces[place], []
+        if all(isinstance(part, int) for part in piece):
+            return None
+        return np.concatenate([np.full(part, np.nan) if isinstance(part, int) else part for part in piece])
+
+
+def through(path: Path, step: Callable[[ByteArray, bool], int]) -> None:
+    """Lead a file through `step` block by block.
+
+    `step(bytes, last)` uses what it can from the front and says how much; the rest comes again with more behind it. It must use
+    everything of the last block, and all but a small part of a full one.
+    """
+    store = bytearray(BLOCK)
+    buffer: ByteArray = np.frombuffer(store, dtype=np.uint8)
+    held = 0
+    with path.open("rb") as file:
+        while True:
+            got = file.readinto(memoryview(store)[held:])
+            used = step(buffer[: held + got], got == 0)
+            if got == 0:
+                return
+            held = held + got - used
+            if held == BLOCK:
+                raise AssertionError("a step must use up a full block")  # else this would never end
+            buffer[:held] = buffer[used : used + held].copy()

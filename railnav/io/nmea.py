@@ -1,0 +1,101 @@
+r"""NMEA 0183 logs: GGA, GNS, RMC, GLL, GST, VTG and ZDA of one instant make one fix.
+
+Sentences may stand among other bytes (binary messages, time stamps of a logger): one begins at a `$`. Any talker is read (GN, GP,
+GL, GA, GB, ...). Where two talkers state a position for one instant, the better kind of fix, then the one with more satellites
+is kept. A VTG has no time of its own and belongs to the sentence before it.
+
+Height is that above the geoid plus the separation that the same sentence states; where it states none there is no height, since an
+assumed geoid would be a default in silence.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from railnav.io import _kernels, gnss_time
+from railnav.io.gnss_log import BLOCK, COLUMNS, ByteArray, Found, Gathered, IntArray, rank, through
+
+#: Sentences that are used, in the order of their counters.
+SENTENCES = ("GGA", "GNS", "RMC", "GLL", "GST", "VTG", "ZDA", "other")
+#: Kinds of fix (GGA quality), larger is better: RTK, float, differential, single, dead reckoning.
+ORDER = {4: 6, 5: 5, 2: 4, 3: 4, 9: 4, 1: 3, 6: 2, 7: 1, 8: 1}
+
+_CHECKED = re.compile(rb"\$[A-Z0-9]{3,5},[^\r\n$*]*\*[0-9A-Fa-f]{2}")
+_SHORTEST = 24  # bytes of a sentence that can open an epoch
+
+
+def scan(path: Path, start: int) -> Found:
+    """Collect the fixes of a log; `start` (ns since 1970) gives the day where no sentence does.
+
+    References
+    ----------
+    NMEA 0183 version 4.11, sentences GGA, GLL, GNS, GST, RMC, VTG, ZDA; checksum: exclusive or of all bytes between $ and *.
+    """
+    count = np.zeros(_kernels.NMEA_COUNTERS, dtype=np.int64)
+    count[_kernels.LAST_DAY] = count[_kernels.CURRENT] = -1
+    slot = np.zeros((_kernels.SLOTS, _kernels.S_INTEGERS), dtype=np.int64)
+    slot_row = np.full((_kernels.SLOTS, _kernels.S_NUMBERS), np.nan)
+    out = np.empty((BLOCK // _SHORTEST // 4, _kernels.WIDTH))
+    stamp = np.empty((len(out), 3), dtype=np.int64)
+    numbers, stamps = Gathered(COLUMNS), Gathered(("time", "day", "row"))
+    checked = _has_checksums(path)
+
+    def step(data: ByteArray, last: bool) -> int:
+        used = 0
+        while True:
+            more, rows = _kernels.nmea_block(data[used:], last, checked, slot, slot_row, count, out, stamp)
+            numbers.add(out[:rows])
+            stamps.add(stamp[:rows])
+            used += int(more)
+            if rows < len(out) - _kernels.SLOTS:
+                return used
+
+    through(path, step)
+    row = _integers(stamps, "row")
+    of_day, day = _integers(stamps, "time"), _integers(stamps, "day")
+    number = {name: values for name in COLUMNS if (values := numbers.take(name)) is not None}
+    found = Found(
+        file=path,
+        format="nmea",
+        unit="sentences",
+        stamp=of_day,
+        number=number,
+        row=row,
+        better=np.empty(0),
+        good=int(count[_kernels.GOOD]),
+        broken=int(count[_kernels.BROKEN]),
+        first_broken=int(count[_kernels.FIRST_BROKEN]) if count[_kernels.BROKEN] else None,
+        void=int(count[_kernels.VOID]),
+        duplicates=int(count[_kernels.DUPLICATES]),
+        counts={name: int(count[_kernels.KINDS + k]) for k, name in enumerate(SENTENCES)},
+    )
+    if len(of_day):
+        day, stated = gnss_time.days(of_day, day, start)
+        found.stamp = day * gnss_time.DAY + of_day
+        if not stated:
+            found.notes.append("no sentence states the date; the day nearest to run.start was taken")
+        quality = number.get("quality")
+        found.better = rank(
+            np.zeros(len(row)) if quality is None else quality, number.get("satellites"), number.get("hdop"), ORDER
+        )
+    if count[_kernels.NO_HEIGHT]:
+        found.notes.append(
+            f"{count[_kernels.NO_HEIGHT]} heights above the geoid come without its separation and are left out"
+        )
+    if not checked and found.good:
+        found.notes.append("its sentences have no checksums and were taken as they are")
+    return found
+
+
+def _integers(stamps: Gathered, name: str) -> IntArray:
+    values = stamps.take(name)
+    return np.empty(0, dtype=np.int64) if values is None else values
+
+
+def _has_checksums(path: Path) -> bool:
+    """Whether the head of the log has a sentence with a checksum: then one without is a torn one."""
+    with path.open("rb") as file:
+        return _CHECKED.search(file.read(BLOCK)) is not None
