@@ -8,6 +8,9 @@ rotates; no normal equations, no difference of covariances.
   `constant_velocity_chain` make the rows of the usual states.
 - **Constants and few noises.** `solve_bordered_chain`: rows that also hold constants (scale, lever arm, run bias);
   `solve_driven_chain`: process noise of a rank below n.
+- **Merging.** `ChainRecords` is what a chain knows; `merge_chain` puts it beside the rows of a new run, `change_test` says before
+  where something moved, `aged` and `forgotten` let go; `observe_between` takes fixes between nodes, `reverse_chain` the other
+  direction.
 - **Groups.** `group_least_squares` finds unknowns group by group, by projections kept as orthonormal bases.
 - **Covariance roots.** `predict`, `update`, `smooth` on P_sqrt (lower triangular, positive diagonal, P = P_sqrt P_sqrt^T);
   `inverse_root` whitens, `lower_root` takes roots, `repair_covariance` mends rounding. Compiled loops elsewhere call
@@ -38,6 +41,14 @@ from railnav.estimation.gross_error import (
 )
 from railnav.estimation.groups import GroupSolution, group_least_squares
 from railnav.estimation.menus import constant_velocity_chain, increment_chain
+from railnav.estimation.merging import (
+    ChainRecords,
+    ChangeTest,
+    change_test,
+    merge_chain,
+    observe_between,
+    reverse_chain,
+)
 from railnav.estimation.square_root import (
     RepairedCovariance,
     Smoothed,
@@ -56,7 +67,9 @@ __all__ = [
     "BorderedSolution",
     "Chain",
     "ChainFilter",
+    "ChainRecords",
     "ChainSolution",
+    "ChangeTest",
     "Consistency",
     "Coverage",
     "DrivenSolution",
@@ -68,6 +81,7 @@ __all__ = [
     "SweepResult",
     "Update",
     "block_test",
+    "change_test",
     "chi_square_limit",
     "component_test",
     "consistency",
@@ -80,9 +94,12 @@ __all__ = [
     "increment_chain",
     "inverse_root",
     "lower_root",
+    "merge_chain",
     "nees",
+    "observe_between",
     "predict",
     "repair_covariance",
+    "reverse_chain",
     "smooth",
     "solve_bordered_chain",
     "solve_chain",
