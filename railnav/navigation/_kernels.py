@@ -44,6 +44,7 @@ from railnav.navigation.columns import (
     C_DISTRUST,
     C_FIX_TIME,
     C_FIXES,
+    C_FORCE_REST,
     C_FRAME_SIGMA,
     C_FRAME_TIME,
     C_FRESH,
@@ -108,6 +109,7 @@ from railnav.navigation.columns import (
     K_TAG_MOST,
     K_USABLE,
     KICK,
+    LEAVING,
     LOST,
     NEEDS_ROOM,
     NEEDS_START,
@@ -235,8 +237,12 @@ def heaviest(bank):
 
 
 @part
-def stands(fil, shared, bank, time):
-    """Whether the train is found to stand: wheels at rest and no GNSS speed against it; without wheels, GNSS speed at rest."""
+def stands(fil, shared, bank, row):
+    """Whether the train is found to stand: wheels at rest and no GNSS speed against it; without wheels, GNSS speed at rest.
+
+    A train at rest leaves when its specific force changes: a slow GNSS must not make an accelerometer bias of it.
+    """
+    time = row[TIME]
     rest = fil.settings[K_STILL_TIME]
     common = shared.common
     best = heaviest(bank)
@@ -248,9 +254,18 @@ def stands(fil, shared, bank, time):
         if spoken and common[C_GNSS_SPEED] > 1.0:
             return False
         return time - common[C_WHEEL_MOVED] >= rest
-    if spoken and common[C_SUSPECTS] == 0.0 and time > common[C_DISTRUST]:
-        return time - common[C_GNSS_STILL] >= 3.0 * rest
-    return False
+    if not (spoken and common[C_SUSPECTS] == 0.0 and time > common[C_DISTRUST]):
+        return False
+    force = row[FORCE]
+    if time - common[C_GNSS_STILL] < 3.0 * rest:
+        common[C_FORCE_REST] = force
+        return False
+    if force == force:
+        if abs(force - common[C_FORCE_REST]) > LEAVING:
+            common[C_GNSS_STILL] = time
+            return False
+        common[C_FORCE_REST] += 0.05 * (force - common[C_FORCE_REST])
+    return True
 
 
 @part
@@ -413,7 +428,7 @@ def sense_all(fil, net, shared, bank, work, row, dt):
     at = fil.at
     common = shared.common
     i_s, i_v, i_d = at[POSITION], at[SPEED], at[WHEEL_DISTANCE]
-    still = stands(fil, shared, bank, row[TIME])
+    still = stands(fil, shared, bank, row)
     if still:
         common[C_STOOD] = 1.0
     elif common[C_STOOD] == 1.0:

@@ -164,8 +164,9 @@ OUTPUT_SIZE = 13
     C_JUMPS,  # steps lately, forgotten over half a minute
     C_FRAME_TIME,  # when the constant part's prior was last looked at
     C_DISTRUST,  # until when a receiver's resting speed is not believed: its positions moved meanwhile
-) = range(33)
-COMMON_SIZE = 33
+    C_FORCE_REST,  # specific force of the train at rest, slowly averaged
+) = range(34)
+COMMON_SIZE = 34
 #: Odometer readings remembered: time, distance.
 RING = 32
 #: Wheel speed is the mean over this long, s.
@@ -174,6 +175,8 @@ WHEEL_SPAN = 0.5
 FORGET_WHEEL, SHAKE_SPEED = 10.0, 0.1
 #: How long a receiver that said "at rest" while its positions moved is not believed, s.
 DISTRUST = 300.0
+#: Change of the specific force by which a train at rest is seen to leave, m/s^2.
+LEAVING = 0.08
 #: Acceleration of a departing train, m/s^2.
 KICK = 0.7
 #: Random walk of the speed while an accelerometer that should be there is silent, m/s^2/sqrt(Hz).
