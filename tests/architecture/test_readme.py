@@ -1,0 +1,73 @@
+"""What the README prints is run: its commands one after another, and its Python."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+import railnav as rn
+from railnav.cli import main
+from railnav.io.geojson import write_geojson
+from railnav.io.run import write_run
+from railnav.io.truth import write_truth
+from railnav.simulation import SERVICE, SURVEY, Leg
+
+README = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+TRACKS = ("77R-01", "77R-02", "77R-03")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The files that the README speaks of, for two kilometres of the bundled line, simulated."""
+    folder = tmp_path_factory.mktemp("readme")
+    line = rn.demo_line()
+    (folder / "runs").mkdir()
+    for seed in (1, 2):
+        run, _ = rn.simulate(line, Leg(TRACKS, start=50.0, finish=1000.0), seed=seed, outfit=SURVEY, direction="up")
+        write_run(run, folder / "runs" / f"survey-{seed}")
+    run, truth = rn.simulate(line, Leg(TRACKS, start=200.0, finish=800.0), seed=3, outfit=SERVICE, direction="up")
+    write_run(run, folder / "runs" / "train-7")
+    write_truth(truth, folder / "truth.csv")
+    write_geojson(line, folder / "network.geojson")
+    return folder
+
+
+def expanded(word):
+    """What a shell makes of a word."""
+    return sorted(str(p) for p in Path().glob(word)) if "*" in word else [word]
+
+
+@pytest.mark.slow
+def test_commands_run_one_after_another(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    commands = [line.strip().split("#")[0] for line in README.splitlines() if line.startswith("    railnav ")]
+    assert len(commands) >= 6
+    for command in commands:
+        words = [w for word in shlex.split(command)[1:] for w in expanded(word)]
+        result = CliRunner().invoke(main, words)
+        assert result.exit_code == 0, f"{command}: {result.output}"
+        if words[0] == "navigate":  # the README evaluates a CSV
+            again = [w.replace("solution.gpkg", "solution.csv") for w in words]
+            assert CliRunner().invoke(main, again).exit_code == 0
+
+
+@pytest.mark.slow
+def test_python_runs(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    rn.demo_line().to_file("line.gpkg")
+    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    names: dict = {}
+    exec(code, names)  # our own words, above
+    assert names["here"].curvature.shape == ()
+    assert names["there"][0].track == "77R-03"
+    assert (folder / "solution.gpkg").exists()
+
+
+def test_links_lead_somewhere():
+    for target in re.findall(r"\]\(([^)#]+)\)", README):
+        if "://" not in target:
+            assert (Path(__file__).parents[2] / target).exists(), target
