@@ -18,6 +18,7 @@ rotates; no normal equations, no difference of covariances.
   `railnav.estimation._kernels` directly.
 - **Tests.** `block_test`, `component_test`, `geometric_test`: is a measurement wrong? `nees`, `consistency`, `coverage`: does the
   estimator know how wrong it is?
+- **Screening.** `screen_chain` finds gross errors and attributes each to the fix or to the link by what comes after.
 - **Oracle.** `railnav.estimation.oracle`: the same answers by dense least squares, banded normal equations, plain numpy
   rotations and the textbook Kalman filter, for tests and benchmarks.
 
@@ -49,6 +50,7 @@ from railnav.estimation.merging import (
     observe_between,
     reverse_chain,
 )
+from railnav.estimation.screening import Screening, Verdict, screen_chain
 from railnav.estimation.square_root import (
     RepairedCovariance,
     Smoothed,
@@ -77,9 +79,11 @@ __all__ = [
     "GeometricTest",
     "GroupSolution",
     "RepairedCovariance",
+    "Screening",
     "Smoothed",
     "SweepResult",
     "Update",
+    "Verdict",
     "block_test",
     "change_test",
     "chi_square_limit",
@@ -100,6 +104,7 @@ __all__ = [
     "predict",
     "repair_covariance",
     "reverse_chain",
+    "screen_chain",
     "smooth",
     "solve_bordered_chain",
     "solve_chain",
