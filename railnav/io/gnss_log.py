@@ -25,7 +25,7 @@ IntArray = NDArray[np.int64]
 ByteArray = NDArray[np.uint8]
 
 #: Formats of GNSS logs, as run.toml names them.
-LOG_FORMATS = ("nmea",)
+LOG_FORMATS = ("nmea", "rtklib-pos")
 #: A log with more than one broken row, and a larger share of them, is refused.
 MAX_BROKEN_SHARE = 0.1
 #: Bytes read at a time.
@@ -207,6 +207,8 @@ def _reader(path: Path, format: str) -> Callable[[Path, int], Found]:  # noqa: A
     """Choose the reader; numba is not loaded for the others."""
     if format == "nmea":
         from railnav.io.nmea import scan
+    elif format == "rtklib-pos":
+        from railnav.io.rtklib import scan
     else:
         raise RunError(f"{format[:40]!r} is no format of GNSS logs; {', '.join(LOG_FORMATS)} are", file=path)
     return scan

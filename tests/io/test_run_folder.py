@@ -201,8 +201,6 @@ def test_all_real_runs_read(shared_data):
     assert len(run.imu) == 83429
     assert len(run.odometer) == 8343
     assert abs(run.imu.specific_force[:, 2].mean() + 9.81) < 0.1
-    with pytest.raises(RunError, match="'rtklib-pos' is no format that is read here"):
-        read_run(shared_data / "gnss_imu_drive")
 
 
 # --- what is refused: the table ---------------------------------------------------------------------------------------
