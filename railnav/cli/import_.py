@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -30,10 +31,11 @@ def command(
     spacing: float,
     as_json: bool,
 ) -> None:
-    """Turn a track network (GeoJSON or elements CSV) into a reference track model.
+    """Turn a track network (GeoJSON, LandXML or elements CSV) into a reference track model.
 
     GeoJSON (.geojson, .json): one LineString a track, in WGS 84, property `track`. Elements (.csv, .parquet): straights, arcs
-    and clothoids with the coordinates of their start; --crs names their plane.
+    and clothoids with the coordinates of their start; --crs names their plane. LandXML 1.2 (.xml): alignments with profile,
+    cant and station equations, joined where one ends on another; --crs names their plane.
 
     \b
     Example:
@@ -57,16 +59,16 @@ def command(
     elif ending in (".csv", ".parquet"):
         from railnav.io.elements import read_elements
 
-        if request["crs"] is None:
-            raise InputError(
-                "elements need the plane of their coordinates", file=source, remedy="name it, e.g. --crs EPSG:31467"
-            )
-        model = read_elements(source, crs=request["crs"], spacing=spacing)
+        model = read_elements(source, crs=_plane(source, request), spacing=spacing)
+    elif ending == ".xml":
+        from railnav.io.landxml import read_landxml
+
+        model = read_landxml(source, crs=_plane(source, request), spacing=spacing)
     else:
         raise InputError(
             "a network of this ending cannot be imported",
             file=source,
-            remedy="use .geojson, .json or elements .csv or .parquet",
+            remedy="use .geojson, .json, LandXML .xml or elements .csv or .parquet",
         )
     model.to_file(output)
     facts = describe_model(model)
@@ -74,3 +76,14 @@ def command(
         print_json({**facts, "output": output})
     else:
         print_model(facts, f"{output} written")
+
+
+def _plane(source: Path, request: dict[str, Any]) -> Any:
+    """The plane that a file of grid coordinates needs and does not name itself."""
+    from railnav.errors import InputError
+
+    if request["crs"] is None:
+        raise InputError(
+            "grid coordinates need the plane they lie in", file=source, remedy="name it, e.g. --crs EPSG:31467"
+        )
+    return request["crs"]

@@ -1,20 +1,7 @@
 """Track networks as elements: straights, arcs and transitions with the grid coordinates of their starts.
 
-Lengths, radii and coordinates are those of the plane in which the alignment was designed: an arc is an arc in the grid, and
-`length_m` is a grid length. Offsets of the model are true lengths on the ground all the same: grid length over the grid's
-scale, joined with the rise. The curvature of an element runs by t = s/L from k0 to k1 as k0 + (k1 - k0) f(t), cant along
-with it:
-
-========= ============================================= ==========================================
-element   f(t)                                          integral of f
-========= ============================================= ==========================================
-arc       0 (k0 = k1)                                   0
-clothoid  t                                             t^2/2
-bloss     3t^2 - 2t^3                                   t^3 - t^4/2
-cosine    (1 - cos(pi t))/2                             t/2 - sin(pi t)/(2 pi)
-sine      t - sin(2 pi t)/(2 pi)                        t^2/2 + (cos(2 pi t) - 1)/(4 pi^2)
-helmert   2t^2, after the middle -1 + 4t - 2t^2         2t^3/3, 1/6 - t + 2t^2 - 2t^3/3
-========= ============================================= ==========================================
+Lengths, radii and coordinates are those of the plane in which the alignment was designed, and `length_m` is a grid length;
+the laws of the transitions stand in `railnav.io.design`.
 """
 
 from __future__ import annotations
@@ -27,28 +14,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railnav.errors import CrsError, InputError, TrackError
-from railnav.geodesy.grid import GridFrame, frame_for_grid
+from railnav.geodesy.grid import frame_for_grid
+from railnav.io.design import (
+    ARC,
+    BLOSS,
+    CLOTHOID,
+    COSINE,
+    HELMERT,
+    LARGEST_GAP,
+    LARGEST_KINK,
+    SAID_KINK,
+    SINE,
+    STRAIGHT,
+    Cant,
+    Plan,
+    closing,
+    integrate,
+    lay,
+)
 from railnav.io.tables import Column, Table, read_table
-from railnav.track.alignment import KnotTable
 from railnav.track.assembly import TrackSection, assemble
 from railnav.track.model import TrackModel
-from railnav.units import wrap_angle
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-#: An element that ends further than this from the start of the next does not belong to it, m.
-LARGEST_GAP = 0.10
-#: Nor one that ends in a direction further than this from the next one's, rad.
-LARGEST_KINK = np.radians(2.0)
-#: A joint that turns by more than this is said, rad.
-SAID_KINK = np.radians(0.1)
 #: What repeats is said so often, then counted.
 _MOST_NOTES = 20
 #: Stations and lengths that agree within this are continuous, m.
 SAME_STATION = 0.01
-
-STRAIGHT, ARC, CLOTHOID, BLOSS, COSINE, SINE, HELMERT = range(7)
 
 _KINDS = {
     "straight": STRAIGHT, "line": STRAIGHT, "tangent": STRAIGHT,
@@ -80,34 +74,17 @@ _COLUMNS = (
     Column("name", required=False, complete=False, text=True),
 )
 
-#: Gauss-Legendre nodes and weights on [-1, 1].
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
-#: Longest panel of the integration, m.
-_PANEL = 2.0
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Elements:
-    """The elements of one track in order: arrays (n,), m, rad, 1/m."""
+    """The elements of one track in order: arrays (n,), m."""
 
     rows: IntArray
     start: FloatArray
-    length: FloatArray
-    kind: IntArray
-    curvature_start: FloatArray
-    curvature_end: FloatArray
-    easting: FloatArray
-    northing: FloatArray
-    grid_bearing: FloatArray
     height: FloatArray
     gradient: FloatArray
-    cant_start: FloatArray
-    cant_end: FloatArray
-
-    @property
-    def edges(self) -> FloatArray:
-        """Grid lengths from the track's start to the elements' starts and the end, (n + 1,)."""
-        return np.append(0.0, np.cumsum(self.length))
+    plan: Plan
+    cant: Cant
 
 
 def read_elements(path: str | Path, *, crs: Any, spacing: float = 1.0) -> TrackModel:
@@ -170,20 +147,8 @@ def read_elements(path: str | Path, *, crs: Any, spacing: float = 1.0) -> TrackM
         values = number.get(name)
         return np.full(table.length, absent) if values is None else np.where(np.isnan(values), absent, values * scale)
 
-    columns = {
-        "start": number["start_m"],
-        "length": number["length_m"],
-        "kind": kind,
-        "curvature_start": curvature_start,
-        "curvature_end": curvature_end,
-        "easting": number["easting_m"],
-        "northing": number["northing_m"],
-        "grid_bearing": np.radians(number["grid_bearing_deg"]),
-        "height": optional("height_m", absent=np.nan),
-        "gradient": optional("gradient", absent=np.nan),
-        "cant_start": optional("cant_start_mm", 1e-3),
-        "cant_end": optional("cant_end_mm", 1e-3),
-    }
+    cant_start, cant_end = optional("cant_start_mm", 1e-3), optional("cant_end_mm", 1e-3)
+    height, gradient = optional("height_m", absent=np.nan), optional("gradient", absent=np.nan)
     words = table.words
     line, name = (words[key].each() if key in words else [""] * table.length for key in ("line", "name"))
     sections: list[TrackSection] = []
@@ -193,7 +158,18 @@ def read_elements(path: str | Path, *, crs: Any, spacing: float = 1.0) -> TrackM
     for code, track in enumerate(words["track"].word):
         rows = np.flatnonzero(words["track"].code == code)
         rows = _in_order(table, track, rows)
-        elements = _Elements(rows, **{key: values[rows] for key, values in columns.items()})
+        plan = Plan(
+            number["length_m"][rows],
+            kind[rows],
+            curvature_start[rows],
+            curvature_end[rows],
+            number["easting_m"][rows],
+            number["northing_m"][rows],
+            np.radians(number["grid_bearing_deg"][rows]),
+            np.zeros(len(rows)),
+        )
+        cant = Cant(plan.edges, cant_start[rows], cant_end[rows], plan.kind)
+        elements = _Elements(rows, number["start_m"][rows], height[rows], gradient[rows], plan, cant)
         _check_heights(table, track, elements, notes)
         gap, kink = _closing(table, track, elements)
         for i in np.flatnonzero(np.abs(kink) > SAID_KINK):
@@ -203,13 +179,23 @@ def read_elements(path: str | Path, *, crs: Any, spacing: float = 1.0) -> TrackM
         gaps.append(np.hypot(gap[:, 0], gap[:, 1]))
         kinks.append(np.abs(kink))
         try:
-            knots, at_edges = _tabulate(frame, elements, gap, spacing)
+            ends, bearing = integrate(plan, plan.edges)
+            level = np.append(elements.height, elements.height[-1])
+            profile = _profile(elements, frame.ground_scale(ends[:, 0], ends[:, 1], level, bearing))
+            laid = lay(frame, plan, gap=gap, profile=profile, cant=cant, spacing=spacing)
         except (CrsError, TrackError) as error:
             raise InputError(f"track {track!r}: {error}", file=path, row=table.row_of(int(rows[0]))) from error
-        posts = np.column_stack([at_edges, np.append(elements.start, elements.start[-1] + elements.length[-1])])
+        stations = np.append(elements.start, elements.start[-1] + plan.length[-1])
+        posts = np.column_stack([laid.offset(plan.edges), stations])
         sections.append(
             TrackSection(
-                track, knots, line[rows[0]], name[rows[0]], float(posts[0, 1]), float(posts[-1, 1]), _needed(posts)
+                track,
+                laid.tables[0],
+                line[rows[0]],
+                name[rows[0]],
+                float(posts[0, 1]),
+                float(posts[-1, 1]),
+                _needed(posts),
             )
         )
     gap_all, kink_all = np.concatenate(gaps), np.concatenate(kinks)
@@ -295,14 +281,7 @@ def _check_heights(table: Table, track: str, elements: _Elements, notes: list[st
 
 def _closing(table: Table, track: str, elements: _Elements) -> tuple[FloatArray, FloatArray]:
     """What each element misses the next one's start by: (n - 1, 2) m, and bearing, rad; refuse what does not belong."""
-    if len(elements.length) == 1:
-        return np.empty((0, 2)), np.empty(0)
-    inside = np.arange(len(elements.length) - 1)
-    points, _ = _integrate(elements, elements.edges)
-    ends = points[np.searchsorted(elements.edges, elements.edges[1:-1])]
-    gap = np.column_stack([elements.easting[1:], elements.northing[1:]]) - ends
-    turned = elements.grid_bearing[:-1] + _turn(elements, inside, elements.length[:-1])
-    kink = wrap_angle(elements.grid_bearing[1:] - turned)
+    gap, kink = closing(elements.plan)
     apart = np.hypot(gap[:, 0], gap[:, 1])
     wrong = (apart > LARGEST_GAP) | (np.abs(kink) > LARGEST_KINK)
     if wrong.any():
@@ -333,137 +312,19 @@ def _needed(posts: FloatArray) -> FloatArray | None:
 # --- geometry ---------------------------------------------------------------------------------------------------------
 
 
-def _share(kind: IntArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The curvature law f(t) of each kind and its integral from 0."""
-    f, whole = np.zeros_like(t), np.zeros_like(t)
-    for law in np.unique(kind):
-        at = kind == law
-        u = t[at]
-        if law == CLOTHOID:
-            f[at], whole[at] = u, u * u / 2.0
-        elif law == BLOSS:
-            f[at], whole[at] = u * u * (3.0 - 2.0 * u), u**3 - u**4 / 2.0
-        elif law == COSINE:
-            f[at], whole[at] = (1.0 - np.cos(np.pi * u)) / 2.0, u / 2.0 - np.sin(np.pi * u) / (2.0 * np.pi)
-        elif law == SINE:
-            f[at] = u - np.sin(2.0 * np.pi * u) / (2.0 * np.pi)
-            whole[at] = u * u / 2.0 + (np.cos(2.0 * np.pi * u) - 1.0) / (4.0 * np.pi**2)
-        elif law == HELMERT:
-            f[at] = np.where(u < 0.5, 2.0 * u * u, -1.0 + 4.0 * u - 2.0 * u * u)
-            whole[at] = np.where(u < 0.5, 2.0 * u**3 / 3.0, 1.0 / 6.0 - u + 2.0 * u * u - 2.0 * u**3 / 3.0)
-    return f, whole
-
-
-def _turn(elements: _Elements, which: IntArray, s: FloatArray) -> FloatArray:
-    """Change of bearing from the start of elements `which` over s metres of them, rad."""
-    length, k0, k1 = elements.length[which], elements.curvature_start[which], elements.curvature_end[which]
-    _, whole = _share(elements.kind[which], s / length)
-    return np.asarray(k0 * s + (k1 - k0) * length * whole)
-
-
-def _integrate(elements: _Elements, at: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Position (m, 2) and bearing (m,) where each element, laid from its own stated start, has run to grid length `at`.
-
-    A joint belongs to the element that ends there.
-    """
-    edges = elements.edges
-    halves = edges[:-1] + 0.5 * elements.length  # the Helmert law has a break in the middle
-    stops = np.unique(np.concatenate([edges, halves, at]))
-    pieces = np.maximum(1, np.ceil(np.diff(stops) / _PANEL).astype(np.int64))
-    first = np.repeat(np.append(0, np.cumsum(pieces)[:-1]), pieces)
-    share = (np.arange(pieces.sum()) - first) / np.repeat(pieces, pieces)
-    begin = np.repeat(stops[:-1], pieces) + share * np.repeat(np.diff(stops), pieces)
-    width = np.repeat(np.diff(stops) / pieces, pieces)
-    which = np.clip(np.searchsorted(edges, begin + 0.5 * width) - 1, 0, len(elements.length) - 1)
-    s = (begin - edges[which])[:, None] + 0.5 * width[:, None] * (1.0 + _NODES)
-    deep = np.repeat(which[:, None], len(_NODES), axis=1)
-    bearing = elements.grid_bearing[which][:, None] + _turn(elements, deep, s)
-    step_e = 0.5 * width * (np.sin(bearing) @ _WEIGHTS)
-    step_n = 0.5 * width * (np.cos(bearing) @ _WEIGHTS)
-    run = np.column_stack([np.append(0.0, np.cumsum(step_e)), np.append(0.0, np.cumsum(step_n))])
-    border = np.append(begin, stops[-1])  # run is the sum of all panels up to each border
-    owner = np.clip(np.searchsorted(edges, at, side="left") - 1, 0, len(elements.length) - 1)
-    here, origin = run[np.searchsorted(border, at)], run[np.searchsorted(border, edges[owner])]
-    points = np.column_stack([elements.easting[owner], elements.northing[owner]]) + here - origin
-    return points, elements.grid_bearing[owner] + _turn(elements, owner, at - edges[owner])
-
-
 def _profile(elements: _Elements, scale: FloatArray) -> Any:
-    """Height and its slope by grid length: a callable (l, derivative) or None without heights; scale at the edges (n + 1,)."""
+    """Height and its slope by grid length, or None without heights; scale at the edges (n + 1,)."""
     from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
-    edges, height, gradient = elements.edges, elements.height, elements.gradient
+    edges, height, gradient = elements.plan.edges, elements.height, elements.gradient
     if not np.isfinite(height).all():
         return None
     if np.isfinite(gradient).all():
         # the last element keeps its gradient; a gradient is rise over ground, a slope is rise over grid
         slope = np.append(gradient, gradient[-1]) / scale
-        return CubicHermiteSpline(edges, np.append(height, height[-1] + slope[-1] * elements.length[-1]), slope)
+        return CubicHermiteSpline(edges, np.append(height, height[-1] + slope[-1] * elements.plan.length[-1]), slope)
     if len(height) == 1:
         return CubicHermiteSpline(edges, np.repeat(height, 2), np.zeros(2))
     spline = CubicSpline(edges[:-1], height, bc_type="natural")
     slope = spline(edges[[*range(len(height)), -2]], 1)  # the last element keeps the gradient at its start
-    return CubicHermiteSpline(edges, np.append(height, height[-1] + slope[-1] * elements.length[-1]), slope)
-
-
-def _tabulate(frame: GridFrame, elements: _Elements, gap: FloatArray, spacing: float) -> tuple[KnotTable, FloatArray]:
-    """Knots by true ground length, and the offsets of the elements' edges (n + 1,)."""
-    edges = elements.edges
-    at_ends, bearing = _integrate(elements, edges)
-    level = np.append(elements.height, elements.height[-1])
-    profile = _profile(elements, frame.ground_scale(at_ends[:, 0], at_ends[:, 1], level, bearing))
-
-    # true length: ground metres per grid metre on a grid of 1 m, Simpson between
-    count = np.maximum(1, np.ceil(elements.length).astype(np.int64))
-    fine = np.append(
-        np.concatenate(
-            [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(edges, edges[1:], count, strict=False)]
-        ),
-        edges[-1],
-    )
-    coarse = np.linspace(0.0, edges[-1], max(2, int(edges[-1] / 50.0) + 2))  # scale changes by under 1e-10 within 50 m
-    points, bearing = _integrate(elements, coarse)
-    height = np.zeros(len(coarse)) if profile is None else profile(coarse)
-    scale = frame.ground_scale(points[:, 0], points[:, 1], height, bearing)
-
-    def rate(at: FloatArray) -> FloatArray:
-        """Ground metres per grid metre."""
-        slope = 0.0 if profile is None else profile(at, 1)
-        return np.hypot(1.0 / np.interp(at, coarse, scale), slope)
-
-    middle, width = 0.5 * (fine[:-1] + fine[1:]), np.diff(fine)
-    panels = width * (rate(fine[:-1]) + 4.0 * rate(middle) + rate(fine[1:])) / 6.0
-    if len(gap):  # the stated starts hold, so an element is as much longer as it misses the next one along its way
-        chord = at_ends[1:-1] - np.column_stack([elements.easting, elements.northing])[:-1]
-        longer = (gap * chord).sum(axis=1) / (np.hypot(chord[:, 0], chord[:, 1]) * elements.length[:-1])
-        panels *= 1.0 + np.append(longer, 0.0)[np.clip(np.searchsorted(edges, middle) - 1, 0, len(longer))]
-    run = np.append(0.0, np.cumsum(panels))
-    at_edges = run[np.searchsorted(fine, edges)]
-
-    n = max(2, round(run[-1] / spacing) + 1)
-    offset = np.linspace(0.0, run[-1], n)
-    at = np.interp(offset, run, fine)
-    at[-1] = edges[-1]
-    points, bearing = _integrate(elements, at)
-    owner = np.clip(np.searchsorted(edges, at, side="left") - 1, 0, len(elements.length) - 1)
-    share = (at - edges[owner]) / elements.length[owner]
-    if len(gap):  # and what it misses the next one by is spread along it
-        points += np.append(gap, np.zeros((1, 2)), axis=0)[owner] * share[:, None]
-    f, _ = _share(elements.kind[owner], share)
-    k0, k1 = elements.curvature_start[owner], elements.curvature_end[owner]
-    c0, c1 = elements.cant_start[owner], elements.cant_end[owner]
-    ramp = np.where(elements.kind[owner] >= CLOTHOID, f, share)  # cant runs with the curvature of a transition
-    here = np.interp(at, coarse, scale)
-    knots = KnotTable(
-        offset=offset,
-        easting=points[:, 0],
-        northing=points[:, 1],
-        height=np.full(n, np.nan) if profile is None else profile(at),
-        grid_bearing=wrap_angle(bearing),
-        curvature=(k0 + (k1 - k0) * f) / rate(at),
-        gradient=np.zeros(n) if profile is None else profile(at, 1) * here,
-        cant=c0 + (c1 - c0) * ramp,
-        scale=here,
-        covariance_g=np.full((n, 6), np.nan),
-    )
-    return knots, at_edges
+    return CubicHermiteSpline(edges, np.append(height, height[-1] + slope[-1] * elements.plan.length[-1]), slope)
