@@ -4,8 +4,9 @@ This room knows nothing of the Earth, of track or of trains. It takes whitened r
 rotates; no normal equations, no difference of covariances.
 
 - **Chain.** `Chain` holds the rows of a block-bidiagonal Gauss-Markov model, `solve_chain` gives all states with their
-  covariances, NIS and residual statistics, `ChainFilter` takes the same rows live in constant memory. `increment_chain` and
-  `constant_velocity_chain` make the rows of the usual states.
+  covariances, NIS and residual statistics, `ChainFilter` takes the same rows live in constant memory. `increment_chain`,
+  `survey_chain` (drifts, correlated errors) and `constant_velocity_chain` make the rows of the usual states,
+  `fit_planar_curve` estimates a curve through its curvature.
 - **Constants and few noises.** `solve_bordered_chain`: rows that also hold constants (scale, lever arm, run bias);
   `solve_driven_chain`: process noise of a rank below n.
 - **Merging.** `ChainRecords` is what a chain knows; `merge_chain` puts it beside the rows of a new run, `change_test` says before
@@ -41,7 +42,15 @@ from railnav.estimation.gross_error import (
     geometric_tolerance,
 )
 from railnav.estimation.groups import GroupSolution, group_least_squares
-from railnav.estimation.menus import constant_velocity_chain, increment_chain
+from railnav.estimation.menus import (
+    CorrelatedError,
+    IncrementDrift,
+    PlanarCurve,
+    constant_velocity_chain,
+    fit_planar_curve,
+    increment_chain,
+    survey_chain,
+)
 from railnav.estimation.merging import (
     ChainRecords,
     ChangeTest,
@@ -73,11 +82,14 @@ __all__ = [
     "ChainSolution",
     "ChangeTest",
     "Consistency",
+    "CorrelatedError",
     "Coverage",
     "DrivenSolution",
     "FilterEstimate",
     "GeometricTest",
     "GroupSolution",
+    "IncrementDrift",
+    "PlanarCurve",
     "RepairedCovariance",
     "Screening",
     "Smoothed",
@@ -91,6 +103,7 @@ __all__ = [
     "consistency",
     "constant_velocity_chain",
     "coverage",
+    "fit_planar_curve",
     "fixed_lag",
     "geometric_test",
     "geometric_tolerance",
@@ -109,5 +122,6 @@ __all__ = [
     "solve_bordered_chain",
     "solve_chain",
     "solve_driven_chain",
+    "survey_chain",
     "update",
 ]

@@ -111,7 +111,7 @@ def screen_chain(
     Notes
     -----
     Sigma of fixes 1 cm, of increments 2 mm: blunders of 5, 8, 12 cm are detected in 56, 99.8, 100 % of the cases and attributed
-    rightly in all of 2,050. Errors that stay for longer than `look_ahead` (a fix displaced for many epochs) look like a slip.
+    rightly in all of 2,047. Errors that stay for longer than `look_ahead` (a fix displaced for many epochs) look like a slip.
     Links are weakened, not cut, so that the chain stays whole.
 
     References
