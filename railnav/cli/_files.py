@@ -140,7 +140,7 @@ def kind_of(path: Path) -> Kind:
             else "model"
         )
     if ending in (".csv", ".parquet"):
-        names = _columns(path)
+        names = columns(path)
         if {"track", "offset_m", "heading_deg"} <= names and "mode" not in names:
             return "truth"
         return "solution"
@@ -149,7 +149,8 @@ def kind_of(path: Path) -> Kind:
     )
 
 
-def _columns(path: Path) -> set[str]:
+def columns(path: Path) -> set[str]:
+    """Names in the header of a table, .csv or .parquet."""
     if path.suffix.lower() == ".csv":
         with path.open("rb") as file:
             return {name.strip().strip('"') for name in file.readline(65536).decode("utf-8", "replace").split(",")}

@@ -35,7 +35,8 @@ def command(
 
     GeoJSON (.geojson, .json): one LineString a track, in WGS 84, property `track`. Elements (.csv, .parquet): straights, arcs
     and clothoids with the coordinates of their start; --crs names their plane. LandXML 1.2 (.xml): alignments with profile,
-    cant and station equations, joined where one ends on another; --crs names their plane.
+    cant and station equations, joined where one ends on another; --crs names their plane. Axis tables (.csv with the
+    columns n, s, ds, R, cl, tang, rw, hw): points of alignment, joined likewise.
 
     \b
     Example:
@@ -57,9 +58,11 @@ def command(
 
         model = read_geojson(source, **request, spacing=spacing)
     elif ending in (".csv", ".parquet"):
+        from railnav.io.axis_table import AXIS_COLUMNS, read_axis_table
         from railnav.io.elements import read_elements
 
-        model = read_elements(source, crs=_plane(source, request), spacing=spacing)
+        read_table = read_axis_table if _files.columns(source) >= AXIS_COLUMNS else read_elements
+        model = read_table(source, crs=_plane(source, request), spacing=spacing)
     elif ending == ".xml":
         from railnav.io.landxml import read_landxml
 

@@ -207,15 +207,18 @@ def integrate(plan: Plan, at: FloatArray) -> tuple[FloatArray, FloatArray]:
     return points, plan.grid_bearing[owner] + turn(plan, owner, at - edges[owner])
 
 
-def closing(plan: Plan) -> tuple[FloatArray, FloatArray]:
-    """What each element misses the next one's start by, (n - 1, 2) m, and its bearing, (n - 1,) rad."""
-    if len(plan.length) == 1:
-        return np.empty((0, 2)), np.empty(0)
-    inside = np.arange(len(plan.length) - 1)
-    ends, _ = integrate(plan, plan.edges)
-    gap = np.column_stack([plan.easting[1:], plan.northing[1:]]) - ends[1:-1]
-    turned = plan.grid_bearing[:-1] + turn(plan, inside, plan.length[:-1])
-    return gap, wrap_angle(plan.grid_bearing[1:] - turned)
+def closing(
+    plan: Plan, *, end: FloatArray | None = None, end_bearing: float | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """What each element misses the next one's start by, the last one the stated end: (n, 2) m and, of bearings, (n,) rad.
+
+    Without a stated end the last one misses nothing.
+    """
+    ends, bearing = integrate(plan, plan.edges)
+    stated = np.column_stack([plan.easting[1:], plan.northing[1:]])
+    gap = np.vstack([stated, ends[-1] if end is None else end]) - ends[1:]
+    turned = np.append(plan.grid_bearing[1:], bearing[-1] if end_bearing is None else end_bearing) - bearing[1:]
+    return gap, wrap_angle(turned)
 
 
 def lay(
@@ -237,9 +240,9 @@ def lay(
         The plane.
     plan : Plan
         The elements.
-    gap : (n - 1, 2) array
+    gap : (n, 2) array
         What each element misses the next one's start by (`closing`), m; it is spread along the element, so that the stated
-        starts hold.
+        coordinates hold.
     profile : callable, optional
         Height and its slope by grid length; without one, the track has no heights.
     cant : Cant, optional
@@ -274,10 +277,10 @@ def lay(
 
     middle, width = 0.5 * (fine[:-1] + fine[1:]), np.diff(fine)
     panels = width * (rate(fine[:-1]) + 4.0 * rate(middle) + rate(fine[1:])) / 6.0
-    if len(gap):  # the stated starts hold, so an element is as much longer as it misses the next one along its way
-        chord = at_ends[1:-1] - np.column_stack([plan.easting, plan.northing])[:-1]
-        longer = (gap * chord).sum(axis=1) / (np.hypot(chord[:, 0], chord[:, 1]) * plan.length[:-1])
-        panels *= 1.0 + np.append(longer, 0.0)[np.clip(np.searchsorted(edges, middle) - 1, 0, len(longer))]
+    # the stated starts hold, so an element is as much longer as it misses the next one along its way
+    chord = at_ends[1:] - np.column_stack([plan.easting, plan.northing])
+    longer = (gap * chord).sum(axis=1) / np.maximum(np.hypot(chord[:, 0], chord[:, 1]) * plan.length, 1e-12)
+    panels *= 1.0 + longer[np.clip(np.searchsorted(edges, middle) - 1, 0, len(longer) - 1)]
     run = np.append(0.0, np.cumsum(panels))
 
     corners = np.concatenate([edges, [] if cant is None else cant.edges, np.asarray(breaks, np.float64)])
@@ -292,8 +295,7 @@ def lay(
         points, bearing = integrate(plan, at)
         owner = np.clip(np.searchsorted(edges, at, side="left") - 1, 0, len(plan.length) - 1)
         share = (at - edges[owner]) / plan.length[owner]
-        if len(gap):  # and what it misses the next one by is spread along it
-            points += np.append(gap, np.zeros((1, 2)), axis=0)[owner] * share[:, None]
+        points += gap[owner] * share[:, None]  # and what it misses the next one by is spread along it
         here = np.interp(at, coarse, scale)
         tables.append(
             KnotTable(

@@ -176,8 +176,8 @@ def read_elements(path: str | Path, *, crs: Any, spacing: float = 1.0) -> TrackM
             turn = np.degrees(abs(kink[i]))
             row = table.row_of(int(elements.rows[i + 1]))
             notes.append(f"track {track!r}, row {row}: the axis turns {turn:.2f} degrees at the joint")
-        gaps.append(np.hypot(gap[:, 0], gap[:, 1]))
-        kinks.append(np.abs(kink))
+        gaps.append(np.hypot(*gap[:-1].T))
+        kinks.append(np.abs(kink[:-1]))
         try:
             ends, bearing = integrate(plan, plan.edges)
             level = np.append(elements.height, elements.height[-1])
@@ -280,7 +280,7 @@ def _check_heights(table: Table, track: str, elements: _Elements, notes: list[st
 
 
 def _closing(table: Table, track: str, elements: _Elements) -> tuple[FloatArray, FloatArray]:
-    """What each element misses the next one's start by: (n - 1, 2) m, and bearing, rad; refuse what does not belong."""
+    """What each element misses the next one's start by: (n, 2) m, and bearing, rad; refuse what does not belong."""
     gap, kink = closing(elements.plan)
     apart = np.hypot(gap[:, 0], gap[:, 1])
     wrong = (apart > LARGEST_GAP) | (np.abs(kink) > LARGEST_KINK)

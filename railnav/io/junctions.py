@@ -42,7 +42,7 @@ class Design:
         Unique identifier; parts are called `track.1`, `track.2`, ... where it is cut.
     plan : Plan
         Its elements.
-    gap : (n - 1, 2) array
+    gap : (n, 2) array
         What they miss each other by, m.
     posts : callable
         From the track laid out to (p, 2) offsets and chainages, ends included, m.

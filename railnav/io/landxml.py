@@ -163,7 +163,7 @@ def read_landxml(path: str | Path, *, crs: Any, spacing: float = 1.0) -> TrackMo
         )
     except CrsError as error:
         raise CrsError(f"{path}: {error}") from error
-    gaps = np.concatenate([a.closing for a in alignments])
+    gaps = np.hypot(*np.concatenate([a.gap for a in alignments]).T)
     kinks = np.concatenate([a.kink for a in alignments])
     provenance = {
         "format": "LandXML",
@@ -337,7 +337,6 @@ class _Alignment:
     equations: tuple[tuple[float, float, float, float], ...]  # grid length, station back, ahead, sense after
     plan: Plan
     gap: FloatArray
-    closing: FloatArray  # of every element, the last one's against its own stated end
     kink: FloatArray
     profile: Profile | None
     breaks: FloatArray
@@ -364,8 +363,7 @@ def _read_alignment(path: Path, node: Any, unit: str, notes: list[str]) -> _Alig
     if not name:
         raise InputError(f"the Alignment in line {node.sourceline} has no name", file=path, remedy="name it")
     place = _Place(path, name[:60])
-    plan, nodes, shut, kink = _read_plan(place, node, notes)
-    gap, _ = closing(plan)
+    plan, nodes, gap, kink = _read_plan(place, node, notes)
     length = float(plan.edges[-1])
     stated = place.number(node, "length", default=length)
     if abs(stated - length) > SAME_STATION:
@@ -379,8 +377,7 @@ def _read_alignment(path: Path, node: Any, unit: str, notes: list[str]) -> _Alig
         _read_equations(place, node, start, length, notes),
         plan,
         gap,
-        shut,
-        np.abs(kink),
+        np.abs(kink[:-1]),
         profile,
         breaks,
         _read_cant(place, node, start, plan, notes),
@@ -389,7 +386,7 @@ def _read_alignment(path: Path, node: Any, unit: str, notes: list[str]) -> _Alig
 
 
 def _read_plan(place: _Place, node: Any, notes: list[str]) -> tuple[Plan, list[Any], FloatArray, FloatArray]:
-    """Elements, their XML, how far each one's end is from the next one's start (the last: from its own end), m, and kinks, rad."""
+    """Elements, their XML, and what each misses the next one's start by (the last: its own end): m and rad."""
     geometry = _children(node, "CoordGeom")
     if not geometry:
         place.refuse(node, "has no CoordGeom", "export its plan")
@@ -424,9 +421,9 @@ def _read_plan(place: _Place, node: Any, notes: list[str]) -> tuple[Plan, list[A
     if plan.edges[-1] > 5e6:
         place.refuse(geometry[0], f"is {plan.edges[-1] / 1e3:.0f} km long", "check the lengths")
     plan = _swing(place, node, nodes, plan, end)
-    gap, kink = closing(plan)
+    gap, kink = closing(plan, end=end[-1])
+    shut = np.hypot(gap[:, 0], gap[:, 1])
     ends, _ = integrate(plan, plan.edges)
-    shut = np.append(np.hypot(gap[:, 0], gap[:, 1]), np.hypot(*(end[-1] - ends[-1])))
     own = np.hypot(*(end - ends[1:]).T)
     for i in range(len(rows)):
         apart, what = (own[i], "its own end") if own[i] > shut[i] else (shut[i], "the start of the next element")
@@ -447,7 +444,7 @@ def _read_plan(place: _Place, node: Any, notes: list[str]) -> tuple[Plan, list[A
             notes.append(
                 f"{place.alignment}, line {nodes[i].sourceline}: turns {np.degrees(bend):.2f} degrees at its end"
             )
-    return plan, nodes, shut, kink
+    return plan, nodes, gap, kink
 
 
 @dataclass(frozen=True, slots=True, eq=False)
