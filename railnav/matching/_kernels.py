@@ -22,23 +22,24 @@ part = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)
 
 #: Columns of a packed knot: one cache line of eight doubles. Tangents are grid metres per metre of offset.
 OFFSET, EAST, NORTH, D_EAST, D_NORTH, CURVATURE, GRADIENT, CANT = range(8)
-#: Columns of an evaluated point of a path: as a knot without its offset, and d(gradient)/ds.
-P_EAST, P_NORTH, P_D_EAST, P_D_NORTH, P_CURVATURE, P_GRADIENT, P_CANT, P_GRADIENT_RATE = range(8)
-POINT_SIZE = 8
+#: Columns of an evaluated point of a path: as a knot without its offset, d(gradient)/ds, and the model's sigma across the track, m.
+P_EAST, P_NORTH, P_D_EAST, P_D_NORTH, P_CURVATURE, P_GRADIENT, P_CANT, P_GRADIENT_RATE, P_SIGMA_CROSS = range(9)
+POINT_SIZE = 9
 #: Integer marks of a hypothesis.
 COUNT, CURRENT, RECORD, VERSION, MOVED, SIGN = range(6)
 TAGS = 6
 #: Real-valued marks of a hypothesis: time the slip began (-inf: none), time since when the wheel agrees again, evidence that fades.
 SLIP_SINCE, AGREE_SINCE, FADING = range(3)
 INFO = 3
-#: A boundary this far out of reach is armed: its switch may have been thrown, m.
-ARM_DISTANCE = 20.0
+#: A train moves one way or the other beyond this speed, m/s.
+MOVING = 0.2
 
 
 class Network(NamedTuple):
     """A track model as the kernels read it (see `railnav.matching.network`)."""
 
     knots: FloatArray  # (k, 8)
+    sigma_cross: FloatArray  # (k,) m, 0 where the model states none
     knot_start: IntArray  # (t + 1,)
     length: FloatArray  # (t,) m
     move_start: IntArray  # (2 t + 1,) CSR pointer by track end 2 * track + end
@@ -105,6 +106,7 @@ def track_point(net, track, way, local, out):  # m from the entering end -> out 
     out[P_CURVATURE] = sign * (v * knots[j, CURVATURE] + u * knots[j + 1, CURVATURE]) if over == 0.0 else 0.0
     out[P_GRADIENT] = sign * (v * knots[j, GRADIENT] + u * knots[j + 1, GRADIENT])
     out[P_CANT] = sign * (v * knots[j, CANT] + u * knots[j + 1, CANT])
+    out[P_SIGMA_CROSS] = v * net.sigma_cross[j] + u * net.sigma_cross[j + 1]
     out[P_GRADIENT_RATE] = (knots[j + 1, GRADIENT] - knots[j, GRADIENT]) / h if over == 0.0 else 0.0
 
 
@@ -257,8 +259,7 @@ def follow(
 ):  # m, m/s, m -> 0: the path reaches on both sides, 1: it ends ahead, -1: behind
     """Keep a hypothesis' window `margin` ahead of and behind s: extend by permitted movements, one clone for each further one.
 
-    Where the way is known it stays known: going back, a train returns as it came, and alternatives are taken up only at switches
-    that were far enough out of reach to have been thrown.
+    Where the way is known it stays known: going back, a train returns as it came, unless the switch may have been thrown meanwhile.
     """
     track, way, begin, tags = bank.track, bank.way, bank.begin, bank.tags
     ends = 0
@@ -288,7 +289,7 @@ def follow(
             if s < begin[h, 0] and k0 == k1:
                 ends = -1
             break
-        if k1 - k0 > 1 and not speed < -0.2:
+        if k1 - k0 > 1 and not speed < -MOVING:
             break
         bank.logw[h] -= math.log(k1 - k0)
         for k in range(k0 + 1, k1):
@@ -301,7 +302,10 @@ def follow(
 
 @part
 def _rearm(net, bank, h, s, speed, margin):
-    """Arm the switches that are out of reach, and take up the alternatives of an armed one that comes into reach again."""
+    """Arm the switches that a train has left or waits before, and take up an armed one's alternatives when it makes for it.
+
+    A switch that is clear of the train may be thrown while the train stands or draws away.
+    """
     track, way, begin, armed, tags = bank.track, bank.way, bank.begin, bank.armed, bank.tags
     for i in range(tags[h, COUNT] - 1):
         gap = begin[h, i + 1] - s  # the boundary lies ahead when positive
@@ -310,9 +314,9 @@ def _rearm(net, bank, h, s, speed, margin):
         k0, k1 = net.move_start[e], net.move_start[e + 1]
         if k1 - k0 < 2:
             continue
-        if abs(gap) > margin + ARM_DISTANCE:
+        if abs(gap) > 0.75 * margin and (speed < MOVING if ahead else speed > -MOVING):
             armed[h, i] = 1
-        elif armed[h, i] == 1 and ahead and speed > 0.2 and gap < margin:
+        elif armed[h, i] == 1 and ahead and speed > MOVING and gap < margin:
             armed[h, i] = 0
             kept = entering_end(track[h, i + 1], way[h, i + 1])
             bank.logw[h] -= math.log(k1 - k0)
@@ -322,7 +326,7 @@ def _rearm(net, bank, h, s, speed, margin):
                     tags[g, COUNT] = i + 1
                     tags[g, CURRENT] = min(tags[g, CURRENT], i)
                     append(net, bank, g, net.move_to[k])
-        elif armed[h, i] == 1 and not ahead and speed < -0.2 and -gap < margin:
+        elif armed[h, i] == 1 and not ahead and speed < -MOVING and -gap < margin:
             armed[h, i] = 0
             kept = leaving_end(track[h, i], way[h, i])
             bank.logw[h] -= math.log(k1 - k0)
@@ -376,6 +380,8 @@ def same_path(bank, a, b, s_a, margin):
     """Whether two hypotheses stand on the same track, mean to go the same way, and came the same way within `margin` of s_a."""
     i, j = bank.tags[a, CURRENT], bank.tags[b, CURRENT]
     if bank.track[a, i] != bank.track[b, j] or bank.way[a, i] != bank.way[b, j]:
+        return False
+    if bank.tags[a, SIGN] != bank.tags[b, SIGN]:  # one is about to leave forwards, the other backwards
         return False
     up = 1
     while i + up < bank.tags[a, COUNT] and j + up < bank.tags[b, COUNT]:

@@ -19,7 +19,8 @@ def pack_network(model: TrackModel) -> Network:
     -------
     Network
         `knots` (k, 8): offset from the track's start, easting, northing, their derivatives (grid metres per metre of offset),
-        curvature, gradient, cant; SI. Movements by track end, 2 * track + end, as a CSR list of the track ends entered.
+        curvature, gradient, cant; SI. `sigma_cross` (k,) is the model's standard deviation across the track, 0 where it states none.
+        Movements by track end, 2 * track + end, as a CSR list of the track ends entered.
 
     Examples
     --------
@@ -42,6 +43,9 @@ def pack_network(model: TrackModel) -> Network:
             model.cant,
         ]
     )
+    cos, sin = np.cos(model.grid_bearing), np.sin(model.grid_bearing)
+    ee, en, nn = (model.covariance_g[:, i] for i in (0, 1, 3))
+    across = ee * cos**2 - 2.0 * en * sin * cos + nn * sin**2
     a = 2 * model.movements[:, 0] + model.movements[:, 1]
     b = 2 * model.movements[:, 2] + model.movements[:, 3]
     leave, enter = np.concatenate([a, b]), np.concatenate([b, a])
@@ -49,6 +53,7 @@ def pack_network(model: TrackModel) -> Network:
     counts = np.bincount(leave, minlength=2 * len(model.track_id))
     return Network(
         np.ascontiguousarray(knots),
+        np.nan_to_num(np.sqrt(np.maximum(across, 0.0))),
         np.ascontiguousarray(model.knot_start, np.int64),
         np.ascontiguousarray(model.lengths, np.float64),
         np.append(0, np.cumsum(counts)).astype(np.int64),

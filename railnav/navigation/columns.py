@@ -72,6 +72,7 @@ K_GYRO_SCALE = SETTING["gyro_scale"]
 K_CURVATURE_SIGMA = SETTING["curvature_sigma"]
 K_CURVATURE_SHIFT = SETTING["curvature_shift"]
 K_CURVATURE_LENGTH = SETTING["curvature_length"]
+K_CURVATURE_DOUBT = SETTING["curvature_doubt"]
 K_ODOMETER_WALK = SETTING["odometer_scale_walk"]
 K_ODOMETER_SIGMA = SETTING["odometer_sigma"]
 K_ODOMETER_SLIP = SETTING["odometer_slip"]
@@ -185,6 +186,9 @@ SILENT_NOISE = 0.4
 ROW_GATE = 16.0
 #: Change of curvature a metre that the linearised course allows for, 1/m^2.
 BEND_CHANGE = 1e-5
+
+#: Where a model's axis is off by d, its curvature is off by about d over this squared, and for as long, m.
+BLIND_LENGTH = 200.0
 
 #: Columns of a record's numbers, kept for the smoother.
 R_EPOCH, R_PARENT, R_VERSION, R_LOGW, R_PULL, R_SLIP, R_SHAKE, R_STEP, R_TAG, R_SIGN = range(10)

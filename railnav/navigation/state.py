@@ -131,6 +131,9 @@ class Settings:
     curvature_sigma, curvature_shift, curvature_length : float
         Errors of the model's curvature: of its value, 1/m, of the place where it changes, m, and the length over which both are
         correlated, m.
+    curvature_doubt : float
+        Difference in curvature that does not tell one track from another, 1/m: what a surveyed model may be wrong by in
+        transitions. Tracks side by side differ by less, a turnout's leg by ten times as much.
     odometer_scale, odometer_scale_walk : float
         Wheel scale: sigma at the start, and random walk, 1/sqrt(s).
     odometer_sigma : float
@@ -205,6 +208,7 @@ class Settings:
     curvature_sigma: float = 2e-5
     curvature_shift: float = 0.4
     curvature_length: float = 20.0
+    curvature_doubt: float = 2e-4
     odometer_scale: float = 0.01
     odometer_scale_walk: float = 2e-6
     odometer_sigma: float = 0.02
@@ -215,7 +219,7 @@ class Settings:
     standstill_sigma: float = 0.02
     standstill_time: float = 1.0
     reverse_prior: float = 0.02
-    track_confidence: float = 0.95
+    track_confidence: float = 0.99
     coasting_after: float = 3.0
     lost_sigma: float = 500.0
     sigma_usable: float = 60.0

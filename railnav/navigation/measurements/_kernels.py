@@ -20,6 +20,7 @@ from railnav.matching._kernels import (
     P_GRADIENT,
     P_GRADIENT_RATE,
     P_NORTH,
+    P_SIGMA_CROSS,
     POINT_SIZE,
     SIGN,
     SLIP_SINCE,
@@ -30,6 +31,7 @@ from railnav.navigation.columns import (
     ACCELERATION,
     ACCELEROMETER_BIAS,
     BEND_CHANGE,
+    BLIND_LENGTH,
     C_RING,
     C_SCALE,
     C_SIGMA_EAST,
@@ -51,12 +53,14 @@ from railnav.navigation.columns import (
     GYRO_BIAS,
     K_CORRELATED,
     K_COURSE_SIGMA,
+    K_CURVATURE_DOUBT,
     K_CURVATURE_LENGTH,
     K_CURVATURE_SHIFT,
     K_CURVATURE_SIGMA,
     K_GRAVITY,
     K_GYRO_FLOOR,
     K_GYRO_SCALE,
+    K_MODEL,
     K_ODOMETER_SIGMA,
     K_ODOMETER_SPEED,
     K_SLIP_GATE,
@@ -275,6 +279,9 @@ def gyro_row(fil, net, bank, work, h, row, dt):
     # errors of the model's curvature are the same over some length: count them once a length, not once a row
     alike = max(1.0, k[K_CURVATURE_LENGTH] / max(abs(v) * dt, 0.1))
     rough = (k[K_CURVATURE_SIGMA] ** 2 + (slope * k[K_CURVATURE_SHIFT]) ** 2) * alike
+    # where the model does not know where the track lies (a bridged tunnel) it does not know how it bends either
+    poor = probe[P_SIGMA_CROSS] / (BLIND_LENGTH * BLIND_LENGTH)
+    rough += poor * poor * max(1.0, BLIND_LENGTH / max(abs(v) * dt, 0.1))
     moving = min(1.0, abs(v) / 2.0)
     variance = (
         row[SIGMA_YAW] ** 2 + (moving * k[K_GYRO_FLOOR]) ** 2 + v * v * (rest + rough + (k[K_GYRO_SCALE] * mean) ** 2)
@@ -283,9 +290,10 @@ def gyro_row(fil, net, bank, work, h, row, dt):
     h_row[i_v] = mean
     h_row[i_g] = 1.0
     innovation = row[YAW_RATE] - v * mean - x[i_g]
-    evidence = robust_row(
-        x, P_sqrt, h_row, innovation, variance, work.vector[W_F], work.vector[W_KEEP], work.vector[W_MOVE]
-    )
+    # tracks side by side differ in curvature by less than a model is wrong: only a turnout's difference is evidence
+    doubt = project(P_sqrt, h_row, work.vector[W_F]) + variance + (v * k[K_CURVATURE_DOUBT]) ** 2
+    evidence = -0.5 * (min(innovation * innovation / doubt, ROW_GATE) + math.log(doubt))
+    robust_row(x, P_sqrt, h_row, innovation, variance, work.vector[W_F], work.vector[W_KEEP], work.vector[W_MOVE])
     h_row[i_s] = 0.0
     h_row[i_v] = 0.0
     h_row[i_g] = 0.0
@@ -460,6 +468,9 @@ def position_row(fil, net, shared, bank, work, h, row):
     fix[1] = row[NORTH] - at_north - h_north[i_g + 1] * x[i_g + 1] - x[i_fn]
     fix[2] = (k[K_WHITE] * row[SIGMA_EAST]) ** 2 + extra_east
     fix[3] = (k[K_WHITE] * row[SIGMA_NORTH]) ** 2 + extra_north
+    unsure = max(point[P_SIGMA_CROSS] ** 2 - k[K_MODEL] ** 2, 0.0)  # beyond what the frame's sigma holds already
+    fix[2] += unsure
+    fix[3] += unsure
     s_ee = project(P_sqrt, h_east, f_east) + fix[2]
     s_nn = project(P_sqrt, h_north, f_north) + fix[3]
     s_en = 0.0
