@@ -25,7 +25,7 @@ IntArray = NDArray[np.int64]
 ByteArray = NDArray[np.uint8]
 
 #: Formats of GNSS logs, as run.toml names them.
-LOG_FORMATS = ("nmea", "rtklib-pos")
+LOG_FORMATS = ("nmea", "rtklib-pos", "ubx")
 #: A log with more than one broken row, and a larger share of them, is refused.
 MAX_BROKEN_SHARE = 0.1
 #: Bytes read at a time.
@@ -209,6 +209,8 @@ def _reader(path: Path, format: str) -> Callable[[Path, int], Found]:  # noqa: A
         from railnav.io.nmea import scan
     elif format == "rtklib-pos":
         from railnav.io.rtklib import scan
+    elif format == "ubx":
+        from railnav.io.ubx import scan
     else:
         raise RunError(f"{format[:40]!r} is no format of GNSS logs; {', '.join(LOG_FORMATS)} are", file=path)
     return scan

@@ -1,0 +1,100 @@
+"""u-blox binary logs (UBX): NAV-PVT, completed by NAV-COV, NAV-HPPOSLLH and NAV-DOP of the same instant.
+
+Messages may stand among other bytes (NMEA, RTCM). `quality` is stated on the scale of NMEA's GGA: 1 single, 2 differential, 4 fixed,
+5 float, 6 dead reckoning. A two-dimensional fix has no height.
+
+Sigmas: NAV-COV where it is valid; else hAcc / sqrt(2) for each horizontal axis, since hAcc bounds both (a fixed solution shows
+hAcc = 14 mm beside 10 mm an axis), vAcc, and sAcc for the speed.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from railnav.io import _kernels
+from railnav.io.gnss_log import BLOCK, COLUMNS, ByteArray, Found, Gathered, IntArray, rank, through
+from railnav.io.nmea import ORDER
+
+#: Names of messages that a log without NAV-PVT is likely to hold.
+MESSAGES = {
+    0x0107: "NAV-PVT",
+    0x0136: "NAV-COV",
+    0x0114: "NAV-HPPOSLLH",
+    0x0104: "NAV-DOP",
+    0x0101: "NAV-POSECEF",
+    0x0102: "NAV-POSLLH",
+    0x0103: "NAV-STATUS",
+    0x0106: "NAV-SOL",
+    0x0112: "NAV-VELNED",
+    0x0121: "NAV-TIMEUTC",
+    0x0135: "NAV-SAT",
+    0x0213: "RXM-SFRBX",
+    0x0215: "RXM-RAWX",
+    0x1002: "ESF-MEAS",
+    0x1003: "ESF-RAW",
+    0x1015: "ESF-INS",
+}
+_ROOM = 1 << 14
+
+
+def scan(path: Path, start: int) -> Found:  # noqa: ARG001 - the messages state their dates
+    """Collect the fixes of a log.
+
+    References
+    ----------
+    u-blox F9 HPG 1.32 interface description, UBX-22008968: frame 3.2, checksum 3.4, NAV-PVT 3.15.13, NAV-COV 3.15.2,
+    NAV-HPPOSLLH 3.15.9, NAV-DOP 3.15.4.
+    """
+    count = np.zeros(_kernels.UBX_COUNTERS, dtype=np.int64)
+    kinds = np.zeros(1 << 16, dtype=np.int64)
+    slot = np.zeros((_kernels.SLOTS, _kernels.U_INTEGERS), dtype=np.int64)
+    slot_row = np.full((_kernels.SLOTS, _kernels.U_NUMBERS), np.nan)
+    sums = np.empty((2, BLOCK + 1), dtype=np.uint8)
+    out = np.empty((_ROOM, _kernels.WIDTH))
+    stamp = np.empty((_ROOM, 2), dtype=np.int64)
+    numbers, stamps = Gathered(COLUMNS), Gathered(("stamp", "byte"))
+
+    def step(data: ByteArray, last: bool) -> int:
+        used = 0
+        while True:
+            more, rows = _kernels.ubx_block(data[used:], last, sums, slot, slot_row, count, kinds, out, stamp)
+            numbers.add(out[:rows])
+            stamps.add(stamp[:rows])
+            used += int(more)
+            if rows < _ROOM - _kernels.SLOTS:
+                return used
+
+    through(path, step)
+    byte = _integers(stamps, "byte")
+    number = {name: values for name in COLUMNS if (values := numbers.take(name)) is not None}
+    better = np.empty(0)
+    if len(byte):
+        sigma = number.get("sigma_east_m")
+        finer = np.zeros(len(byte)) if sigma is None else np.clip(np.nan_to_num(sigma, nan=1e3), 0, 1e3)
+        better = rank(number["quality"], None, None, ORDER) - finer
+    return Found(
+        file=path,
+        format="ubx",
+        unit="messages",
+        stamp=_integers(stamps, "stamp"),
+        number=number,
+        row=byte,
+        better=better,
+        good=int(count[_kernels.GOOD]),
+        broken=int(count[_kernels.BROKEN]),
+        first_broken=int(count[_kernels.FIRST_BROKEN]) if count[_kernels.BROKEN] else None,
+        void=int(count[_kernels.VOID]),
+        duplicates=int(count[_kernels.DUPLICATES]),
+        counts={_name(int(kind)): int(kinds[kind]) for kind in np.flatnonzero(kinds)},
+    )
+
+
+def _integers(stamps: Gathered, name: str) -> IntArray:
+    values = stamps.take(name)
+    return np.empty(0, dtype=np.int64) if values is None else values
+
+
+def _name(kind: int) -> str:
+    return MESSAGES.get(kind, f"0x{kind >> 8:02X}-0x{kind & 255:02X}")
