@@ -440,16 +440,9 @@ def fit_planar_curve(
         raise EstimationError(f"initial has shape {x.shape}; finite ({N}, 4) fits")
     G = np.zeros((N - 1, 4, 1))
     G[:, 3, 0] = curvature_density * np.sqrt(h)
-    F = np.zeros((N - 1, 4, 4))
-    F[:] = np.eye(4)
-    F[:, 2, 3] = h
     z = np.zeros((N, 3))
     for iteration in range(1, most + 1):
-        middle = x[:-1, 2] + 0.5 * h * x[:-1, 3]
-        sin, cos = np.sin(middle), np.cos(middle)
-        F[:, 0, 2], F[:, 1, 2] = -h * sin, h * cos
-        F[:, 0, 3], F[:, 1, 3] = -0.5 * h * h * sin, 0.5 * h * h * cos
-        ahead = x[:-1] + np.column_stack([h * cos, h * sin, h * x[:-1, 3], np.zeros(N - 1)])
+        ahead, F = _curve_step(x[:-1], h)
         z[:, :2] = np.where(
             present[:, None], np.einsum("kij,kj->ki", rows[:, :2, :2], np.nan_to_num(X - x[:, :2])), 0.0
         )
@@ -462,6 +455,17 @@ def fit_planar_curve(
         f"the curve does not settle in {most} steps (last correction {np.abs(solution.state).max():.2g}); "
         "give a better initial, or look for gross errors in the positions"
     )
+
+
+def _curve_step(x: FloatArray, h: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The next states of a plane curve, and their derivatives by the states."""
+    middle = x[:, 2] + 0.5 * h * x[:, 3]
+    sin, cos = np.sin(middle), np.cos(middle)
+    F = np.zeros((len(x), 4, 4))
+    F[:] = np.eye(4)
+    F[:, 0, 2], F[:, 1, 2], F[:, 2, 3] = -h * sin, h * cos, h
+    F[:, 0, 3], F[:, 1, 3] = -0.5 * h * h * sin, 0.5 * h * h * cos
+    return x + np.column_stack([h * cos, h * sin, h * x[:, 3], np.zeros(len(x))]), F
 
 
 def _start(X: FloatArray, present: BoolArray, h: FloatArray) -> FloatArray:

@@ -281,6 +281,18 @@ def test_northing_and_easting_give_bearing_from_north_and_curvature_to_the_right
     assert curve.state[50, 3] == pytest.approx(1 / 300)
 
 
+def test_derivatives_of_a_step_are_the_differences() -> None:
+    """Acceptance A6."""
+    from railnav.estimation.menus import _curve_step
+
+    rng = np.random.default_rng(8)
+    x, h = rng.normal(0, [100, 100, 2, 0.01], (30, 4)), rng.uniform(0.5, 20, 30)
+    F = _curve_step(x, h)[1]
+    for i, e in enumerate(np.diag([1e-4, 1e-4, 1e-6, 1e-6])):
+        difference = (_curve_step(x + e, h)[0] - _curve_step(x - e, h)[0]) / (2 * e[i])
+        np.testing.assert_allclose(F[:, :, i], difference, rtol=0, atol=1e-6)
+
+
 def test_uneven_steps() -> None:
     rng = np.random.default_rng(7)
     h = rng.uniform(0.5, 2.0, 299)
