@@ -25,7 +25,7 @@ IntArray = NDArray[np.int64]
 ByteArray = NDArray[np.uint8]
 
 #: Formats of GNSS logs, as run.toml names them.
-LOG_FORMATS = ("nmea", "rtklib-pos", "ubx")
+LOG_FORMATS = ("nmea", "rtklib-pos", "ubx", "gpx")
 #: A log with more than one broken row, and a larger share of them, is refused.
 MAX_BROKEN_SHARE = 0.1
 #: Bytes read at a time.
@@ -211,6 +211,8 @@ def _reader(path: Path, format: str) -> Callable[[Path, int], Found]:  # noqa: A
         from railnav.io.rtklib import scan
     elif format == "ubx":
         from railnav.io.ubx import scan
+    elif format == "gpx":
+        from railnav.io.gpx import scan
     else:
         raise RunError(f"{format[:40]!r} is no format of GNSS logs; {', '.join(LOG_FORMATS)} are", file=path)
     return scan
