@@ -63,6 +63,7 @@ from railnav.navigation.columns import (
     C_SIGMA_EAST,
     C_SIGMA_NORTH,
     C_SPEED_STALE,
+    C_START_TIME,
     C_STARTED,
     C_STEPS,
     C_STOOD,
@@ -150,6 +151,8 @@ from railnav.navigation.columns import (
     SIGMA_SPEED,
     SPEED,
     SPEED_LATENCY,
+    START_GATE,
+    START_PROBATION,
     TIME,
     TIME_TAG,
     TRACKING,
@@ -511,6 +514,10 @@ def fix_all(fil, net, shared, bank, work, row):
         common[C_SUSPECTS] += 1.0
         if common[C_SUSPECTS] < k[K_STEP_FIXES] or time - common[C_SUSPECT_SINCE] < 1.0:
             return False
+        if time - common[C_START_TIME] < START_PROBATION:
+            common[C_JUMPS] = np.inf  # start anew
+            common[C_TRY] = -np.inf
+            return False
         step, tag = jump(fil, net, shared, bank, work, row)
         common[C_STEPS] += 1.0
         if common[C_GNSS_SPEED] < 0.5 and at[SPEED_LATENCY] >= 0:
@@ -518,7 +525,7 @@ def fix_all(fil, net, shared, bank, work, row):
             kick(fil, bank, work, row)
     common[C_SUSPECTS] = 0.0
     common[C_FIXES] += 1.0
-    held = 1e4 if fresh else k[K_GATE] + 10.0  # evidence against a hypothesis saturates: a fix may be wrong, too
+    held = START_GATE if fresh else k[K_GATE] + 10.0  # evidence against a hypothesis saturates: a fix may be wrong, too
     most = -np.inf
     i_g = at[GNSS_EAST]
     h_north, f_east, f_north = work.vector[W_H_NORTH], work.vector[W_F], work.vector[W_F_NORTH]

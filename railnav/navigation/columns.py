@@ -166,8 +166,9 @@ OUTPUT_SIZE = 13
     C_FRAME_TIME,  # when the constant part's prior was last looked at
     C_DISTRUST,  # until when a receiver's resting speed is not believed: its positions moved meanwhile
     C_FORCE_REST,  # specific force of the train at rest, slowly averaged
-) = range(34)
-COMMON_SIZE = 34
+    C_START_TIME,
+) = range(35)
+COMMON_SIZE = 35
 #: Odometer readings remembered: time, distance.
 RING = 32
 #: Wheel speed is the mean over this long, s.
@@ -176,6 +177,10 @@ WHEEL_SPAN = 0.5
 FORGET_WHEEL, SHAKE_SPEED = 10.0, 0.1
 #: How long a receiver that said "at rest" while its positions moved is not believed, s.
 DISTRUST = 300.0
+#: A start that later fixes contradict within this time was made on a wrong fix, s.
+START_PROBATION = 20.0
+#: Squared normalised innovation at which the evidence of a first fix saturates: it may itself be the wrong one.
+START_GATE = 9.0
 #: Change of the specific force by which a train at rest is seen to leave, m/s^2.
 LEAVING = 0.08
 #: Acceleration of a departing train, m/s^2.

@@ -16,6 +16,7 @@ from railnav.navigation import _kernels as kernel
 from railnav.navigation import columns as c
 from railnav.navigation.epochs import kernel_table
 from railnav.navigation.integrity import normal_quantile
+from railnav.navigation.prior import USUAL, frame_prior, usual_directions
 from railnav.navigation.state import Settings, State, layout
 
 if TYPE_CHECKING:
@@ -34,13 +35,25 @@ class Engine:
     ----------
     model : TrackModel
     settings : Settings
-    imu, odometer, speed, signed_odometer, lever_arm_b, integrity_risk
+    imu, odometer, speed, signed_odometer, lever_arm_b, receiver, integrity_risk
         As for `railnav.navigation.Navigator`.
     records : int
         Room for the smoother's records, to begin with; 0 keeps none.
     """
 
-    __slots__ = ("bank", "filter", "latitude", "model", "network", "records", "settings", "shared", "work")
+    __slots__ = (
+        "bank",
+        "filter",
+        "frame",
+        "latitude",
+        "model",
+        "network",
+        "records",
+        "settings",
+        "shared",
+        "usual",
+        "work",
+    )
 
     def __init__(
         self,
@@ -53,6 +66,7 @@ class Engine:
         signed_odometer: bool,
         lever_arm_b: ArrayLike,
         integrity_risk: float,
+        receiver: str = "",
         records: int = 0,
     ) -> None:
         if not 0.0 < integrity_risk < 1.0:
@@ -60,7 +74,15 @@ class Engine:
         if odometer not in ("distance", "speed", ""):
             raise ValueError(f"odometer {odometer!r} is not 'distance', 'speed' or ''")
         self.model = model
+        self.frame = frame_prior(model, receiver)
+        self.usual = usual_directions(model)
         self.settings = _settings_for(model, settings)
+        if self.frame.sigma > 0.0:
+            self.settings = replace(
+                self.settings,
+                model_sigma=math.hypot(self.settings.model_sigma, self.frame.sigma),
+                gnss_frame_share=0.0 if self.frame.known else self.settings.gnss_frame_share,
+            )
         self.network = pack_network(model)
         middle, _, _ = model.frame.to_geodetic(model.easting[[0, -1]].mean(), model.northing[[0, -1]].mean(), None)
         self.latitude = float(middle)
@@ -128,7 +150,10 @@ class Engine:
 
     def table(self, raw: FloatArray) -> FloatArray:
         """Raw epochs as the loop reads them; see `railnav.navigation.epochs.kernel_table`."""
-        return kernel_table(raw, self.model.frame, self.latitude)
+        table = kernel_table(raw, self.model.frame, self.latitude)
+        table[:, c.EAST] -= self.frame.east
+        table[:, c.NORTH] -= self.frame.north
+        return table
 
     def living(self) -> list[int]:
         """Slots of the living hypotheses."""
@@ -169,7 +194,7 @@ class Engine:
         common[[c.C_FRESH, c.C_STARTED]] = 1.0
         common[c.C_STARTS] += 1.0
         common[[c.C_SUSPECTS, c.C_STOOD]] = 0.0
-        common[[c.C_FIX_TIME, c.C_TIME]] = time
+        common[[c.C_FIX_TIME, c.C_TIME, c.C_START_TIME]] = time
         speed, sigma_speed = float(row[c.GNSS_SPEED]), float(row[c.SIGMA_SPEED])
         if not sigma_speed > 0.0:
             sigma_speed = settings.speed_sigma
@@ -183,6 +208,8 @@ class Engine:
                     return
                 local = start.offset if way > 0 else float(self.network.length[start.track]) - start.offset
                 self._seed(h, local, v, sigma, sigma_v)
+                if usual := int(self.usual[start.track]):
+                    prior *= USUAL if way == usual else 1.0 - USUAL
                 bank.logw[h] = math.log(prior)
                 bank.track[h, 0], bank.way[h, 0], bank.begin[h, 0] = start.track, way, 0.0
                 bank.armed[h] = 0

@@ -115,10 +115,12 @@ class Navigator:
         Whether backing up subtracts from the distance.
     lever_arm_b : (3,) array
         Reference point to antenna: forward, right, down, m.
+    receiver : str
+        Kind of GNSS receiver; one that the model's survey knows is moved to the model's datum.
     integrity_risk : float
         Risk, per epoch, that the along-track error exceeds the protection level.
     settings : Settings, optional
-        What is assumed of sensors and trains.
+        What is assumed of sensors and trains; by default `Settings.of_receiver`.
 
     Notes
     -----
@@ -140,18 +142,20 @@ class Navigator:
         speed: bool = True,
         signed_odometer: bool = False,
         lever_arm_b: ArrayLike = (0.0, 0.0, 0.0),
+        receiver: str = "",
         integrity_risk: float = 1e-4,
         settings: Settings | None = None,
     ) -> None:
         self._engine = Engine(
             model,
-            settings or Settings(),
+            settings or Settings.of_receiver(receiver),
             imu=imu,
             odometer=odometer,
             speed=speed,
             signed_odometer=signed_odometer,
             lever_arm_b=lever_arm_b,
             integrity_risk=integrity_risk,
+            receiver=receiver,
         )
         self._raw = np.empty((1, len(COLUMNS)))
         self._row = np.empty((1, c.OUTPUT_SIZE))

@@ -63,7 +63,7 @@ def navigate(
     Returns
     -------
     Solution
-        One row an epoch. `track_probability` is the posterior of the row's track; below 0.95 the mode is ambiguous.
+        One row an epoch. `track_probability` is the posterior of the row's track; below 0.99 the mode is ambiguous.
         `protection_level_along` bounds the error along the track over all hypotheses, also those on other tracks (their places are
         projected onto the row's track), so that it holds whichever track is right; that the track is right, it does not say.
         `sigma_cross` is the model's, or 0.5 m where the model states none (diagnostics: sigma_cross_assumed).
@@ -99,6 +99,7 @@ def navigate(
         signed_odometer=odometer is not None and odometer.signed,
         lever_arm_b=gnss.lever_arm_b,
         integrity_risk=integrity_risk,
+        receiver=gnss.receiver,
         records=2 * m + 2 * SLOTS if smooth else 0,
     )
     table = engine.table(raw)
