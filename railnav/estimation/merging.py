@@ -93,6 +93,78 @@ class ChainRecords:
         """
         return cls(solution.records, solution.triangle)
 
+    @classmethod
+    def of_marginals(
+        cls, state: ArrayLike, covariance: ArrayLike, lag_one: ArrayLike, *, components: ArrayLike | None = None
+    ) -> ChainRecords:
+        """Keep some components of a solution only: the chain that comes nearest to their joint distribution.
+
+        p(x_k | x_(k+1)) is taken from the joint covariance of neighbours: gain G = C_k P_(k+1)^-1, covariance P_k - G C_k^T.
+        For what a run brought of its own, drifts or a correlated error, and what need not be stored; also for solutions with a
+        border, whose constants are in the covariances.
+
+        Parameters
+        ----------
+        state, covariance, lag_one : (N, n), (N, n, n), (N - 1, n, n) array
+            As in `ChainSolution`.
+        components : integer array, optional
+            Which of the n to keep; all by default.
+
+        Returns
+        -------
+        ChainRecords
+            Rows with the given means, covariances and covariances of neighbours.
+
+        Raises
+        ------
+        EstimationError
+            Shapes do not fit, or the joint covariance of two neighbours is singular.
+
+        Notes
+        -----
+        Exact if the kept components are a chain by themselves. Otherwise nodes further apart are taken as dependent through
+        their neighbours only: of all chains the one nearest in the sense of Kullback and Leibler. Means, sigmas and neighbours
+        stay exact; an error that a run has over its whole length is forgotten with the distance.
+
+        References
+        ----------
+        Specification rail 23, end of pass.
+        """
+        x, P, C = as_floats("state", state), as_floats("covariance", covariance), as_floats("lag_one", lag_one)
+        if x.ndim != 2 or P.shape != (*x.shape, x.shape[1]) or C.shape != (len(x) - 1, *P.shape[1:]):
+            raise EstimationError(f"state {x.shape}, covariance {P.shape} and lag_one {C.shape} do not fit each other")
+        if components is not None:
+            kept = np.asarray(components, np.int64)
+            x, P, C = x[:, kept], P[:, kept[:, None], kept], C[:, kept[:, None], kept]
+        n = x.shape[1]
+        # joint of (x_(k+1), x_k), in units of their sigmas: its root gives gain and covariance without a difference
+        sigma = np.sqrt(np.einsum("kii->ki", P))
+        scale = np.concatenate([sigma[1:], sigma[:-1]], axis=1)
+        joint = np.concatenate(
+            [
+                np.concatenate([P[1:], np.swapaxes(C, 1, 2)], axis=2),
+                np.concatenate([C, P[:-1]], axis=2),
+            ],
+            axis=1,
+        )
+        with np.errstate(invalid="ignore", divide="ignore"):
+            joint = joint / (scale[:, :, None] * scale[:, None, :])
+        try:
+            root = np.linalg.cholesky(joint) * scale[:, :, None]
+        except np.linalg.LinAlgError:
+            raise EstimationError(
+                "the joint covariance of two neighbouring nodes is singular: they are known to move as one; keep the full records"
+            ) from None
+        G = np.swapaxes(
+            np.linalg.solve(np.swapaxes(root[:, :n, :n], 1, 2), np.swapaxes(root[:, n:, :n], 1, 2)), 1, 2
+        )  # B A^-1
+        D = root[:, n:, n:]
+        W = inverse_root(D @ np.swapaxes(D, 1, 2)) if len(D) else np.zeros((0, n, n))
+        step = x[:-1] - np.einsum("kij,kj->ki", G, x[1:])
+        records = np.concatenate([W, -W @ G, np.einsum("kij,kj->ki", W, step)[:, :, None]], axis=2)
+        last = inverse_root(P[-1])
+        return cls(records, np.column_stack([last, last @ x[-1]]))
+
     def as_chain(self) -> Chain:
         """Give the rows as a chain without observations but at the last node.
 

@@ -9,12 +9,15 @@ from railnav.errors import EstimationError
 from railnav.estimation import (
     Chain,
     ChainRecords,
+    CorrelatedError,
+    IncrementDrift,
     change_test,
     increment_chain,
     merge_chain,
     observe_between,
     reverse_chain,
     solve_chain,
+    survey_chain,
 )
 
 SIGMA = np.array([0.01, 0.01, 0.02])
@@ -248,6 +251,36 @@ def test_other_nominal_values() -> None:
     moved = ChainRecords.of(solution).shifted(shift).solve()
     np.testing.assert_allclose(moved.state, solution.state - shift, rtol=0, atol=1e-11)
     np.testing.assert_allclose(moved.covariance, solution.covariance, rtol=0, atol=1e-12)
+
+
+def test_records_of_marginals_are_the_records() -> None:
+    solution = solve_chain(random_chain(16, prior=True))
+    again = ChainRecords.of_marginals(solution.state, solution.covariance, solution.lag_one)
+    same(again.solve(), solution, 1e-9)
+    two = random_chain(17)
+    same(solve_chain(merge_chain(again, two)), solve_chain(merge_chain(ChainRecords.of(solution), two)), 1e-9)
+
+
+def test_positions_of_a_survey_with_drifts_are_kept_without_the_drifts() -> None:
+    truth, _ = axis(201)
+    rng = np.random.default_rng(18)
+    X = truth + rng.normal(0, 0.01, truth.shape)
+    X[np.arange(201) % 5 != 0] = np.nan
+    dX = np.diff(truth, axis=0) + rng.normal(0, SIGMA_STEP, (200, 3))
+    error, drift = CorrelatedError(0.01, 300.0, 1.0), IncrementDrift(np.eye(3), [1e-3] * 3, [1e-5] * 3)
+    wide = solve_chain(
+        survey_chain(X, 1e-4 * np.eye(3), dX, SIGMA_STEP**2 * np.eye(3), drift=drift, correlated=error, nominal=truth)
+    )
+    stored = ChainRecords.of_marginals(wide.state, wide.covariance, wide.lag_one, components=[0, 1, 2])
+    assert stored.n == 3
+    narrow = stored.solve()
+    np.testing.assert_allclose(narrow.state, wide.state[:, :3], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(narrow.covariance, wide.covariance[:, :3, :3], rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(narrow.lag_one, wide.lag_one[:, :3, :3], rtol=1e-6, atol=1e-12)
+    with pytest.raises(EstimationError, match="known to move as one"):
+        ChainRecords.of_marginals(np.zeros((2, 1)), np.ones((2, 1, 1)), np.ones((1, 1, 1)))
+    with pytest.raises(EstimationError, match="do not fit each other"):
+        ChainRecords.of_marginals(np.zeros((2, 1)), np.ones((2, 1, 1)), np.ones((2, 1, 1)))
 
 
 # ---------------------------------------------------------------- change
