@@ -19,7 +19,7 @@ from railnav.estimation import (
     smooth,
     update,
 )
-from railnav.estimation.oracle import kalman_rts
+from railnav.estimation.oracle import insert_row, kalman_rts
 
 
 def covariance(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -331,3 +331,27 @@ def test_nees_of_a_simulated_filter_lies_inside_its_bounds() -> None:
         scores.append(nees([x - truth], root @ root.T)[0])
     assert consistency(scores, 2).consistent
     assert consistency(nis, 1).consistent
+
+
+# ---------------------------------------------------------------- half the digits
+
+
+def test_float32_square_root_keeps_what_a_float32_covariance_loses() -> None:
+    """Rail 15.8: sigma of 1 km before, 1 cm rows after. The covariance filter ends at a variance of 0, the root at the true one."""
+    one = np.float32
+    rows = [np.array([1.0, 1e-3 * (k % 5)]) for k in range(200)]
+    exact = np.linalg.inv(np.eye(2) * 1e-6 + sum(np.outer(h, h) / 1e-4 for h in rows))
+    P, W = one(1e6) * np.eye(2, dtype=one), np.zeros((2, 3), one)
+    W[0, 0] = W[1, 1] = 1e-3
+    for h64 in rows:
+        h = h64.astype(one)
+        gain = (P @ h) / (h @ P @ h + one(1e-4))
+        P = P - np.outer(gain, h @ P)
+        insert_row(W, np.append(h / one(1e-2), one(0.0)).astype(one))
+    assert W.dtype == P.dtype == np.float32
+    R = W[:, :2].astype(float)
+    root = np.linalg.inv(R.T @ R)
+    np.testing.assert_allclose(root[0, 0], exact[0, 0], rtol=1e-5)
+    np.testing.assert_allclose(root[1, 1], exact[1, 1], rtol=1e-5)
+    assert abs(P[0, 0] - exact[0, 0]) > 0.5 * exact[0, 0]
+    assert abs(P[1, 1] - exact[1, 1]) > 0.5 * exact[1, 1]
