@@ -75,6 +75,7 @@ from railnav.navigation.columns import (
     C_WHEEL_MOVED,
     C_WHEEL_SEEN,
     COASTING,
+    DIRECTION_CONFIDENCE,
     DISTANCE,
     DISTRUST,
     DONE,
@@ -742,7 +743,7 @@ def put_out(fil, net, shared, bank, work, row, out):
     out[OUT_SIGMA] = math.sqrt(variance)
     out[OUT_PROBABILITY] = min(probability, 1.0)
     out[OUT_LEVEL] = mixture_bound(work.mix[0], work.mix[1], work.mix[2], live, fil.risk[0], fil.risk[1])
-    out[OUT_DIRECTION] = way if forward >= k[K_CONFIDENCE] * probability else 0.0
+    out[OUT_DIRECTION] = way if forward >= DIRECTION_CONFIDENCE * probability else 0.0
     if probability < k[K_CONFIDENCE]:
         out[OUT_MODE] = AMBIGUOUS
     elif row[TIME] - common[C_FIX_TIME] > k[K_COASTING]:

@@ -177,6 +177,8 @@ WHEEL_SPAN = 0.5
 FORGET_WHEEL, SHAKE_SPEED = 10.0, 0.1
 #: How long a receiver that said "at rest" while its positions moved is not believed, s.
 DISTRUST = 300.0
+#: Posterior at which the direction of the nose is told (a train without an IMU is presumed to run nose first, at 0.98).
+DIRECTION_CONFIDENCE = 0.95
 #: A start that later fixes contradict within this time was made on a wrong fix, s.
 START_PROBATION = 20.0
 #: Squared normalised innovation at which the evidence of a first fix saturates: it may itself be the wrong one.
