@@ -57,6 +57,7 @@ from railnav.navigation.columns import (
     C_OUT_WAY,
     C_REVISIONS,
     C_RING,
+    C_RIVAL_TIME,
     C_SCALE,
     C_SCALE_SUM,
     C_SCALE_WEIGHT,
@@ -113,6 +114,7 @@ from railnav.navigation.columns import (
     KICK,
     LEAVING,
     LOST,
+    NEEDS_RIVALS,
     NEEDS_ROOM,
     NEEDS_START,
     OFF_MODEL,
@@ -138,6 +140,7 @@ from railnav.navigation.columns import (
     R_PULL,
     R_VERSION,
     RING,
+    RIVAL_INTERVAL,
     S_MASS,
     S_NIS,
     S_PULL,
@@ -810,6 +813,8 @@ def run(fil, net, shared, bank, work, records, epochs, first, out):
         seen = row[EAST] == row[EAST] and row[SIGMA_EAST] <= usable and row[SIGMA_NORTH] <= usable
         if bank.live[0] == 0 and seen and not row[TIME] - shared.common[C_TRY] < 1.0:
             return e, NEEDS_START
+        if bank.live[0] > 0 and seen and row[TIME] - shared.common[C_RIVAL_TIME] >= RIVAL_INTERVAL:
+            return e, NEEDS_RIVALS
         watch(fil, shared, row)
         advance(fil, net, shared, bank, work, records, row, e)
         remember(shared, row)

@@ -167,8 +167,11 @@ OUTPUT_SIZE = 13
     C_DISTRUST,  # until when a receiver's resting speed is not believed: its positions moved meanwhile
     C_FORCE_REST,  # specific force of the train at rest, slowly averaged
     C_START_TIME,
-) = range(35)
-COMMON_SIZE = 35
+    C_RIVAL_TIME,  # when tracks nearby were last given a rival hypothesis
+) = range(36)
+COMMON_SIZE = 36
+#: How often tracks nearby that no hypothesis holds are given a rival, s.
+RIVAL_INTERVAL = 60.0
 #: Odometer readings remembered: time, distance.
 RING = 32
 #: Wheel speed is the mean over this long, s.
@@ -212,7 +215,7 @@ SLOT_SIZE = 9
 NOISES = 16
 
 #: Why the loop stopped.
-DONE, NEEDS_START, NEEDS_ROOM = range(3)
+DONE, NEEDS_START, NEEDS_ROOM, NEEDS_RIVALS = range(4)
 
 GAUSS_HERMITE_NODES = np.array([-2.8569700138728056, -1.355626179974266, 0.0, 1.355626179974266, 2.8569700138728056])
 GAUSS_HERMITE_WEIGHTS = np.array(

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from railnav.track.model import TrackModel
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 #: Hypotheses that fit at a time (more than are kept, for those at a start or a fan of turnouts), and tracks in a window.
 SLOTS, WINDOW = 48, 12
@@ -42,6 +43,7 @@ class Engine:
     """
 
     __slots__ = (
+        "_component",
         "bank",
         "filter",
         "frame",
@@ -76,6 +78,7 @@ class Engine:
         self.model = model
         self.frame = frame_prior(model, receiver)
         self.usual = usual_directions(model)
+        self._component = _components(model)
         self.settings = _settings_for(model, settings)
         if self.frame.sigma > 0.0:
             self.settings = replace(
@@ -145,6 +148,8 @@ class Engine:
                 return
             if why == c.NEEDS_ROOM:
                 self.records = _grown(self.records)
+            elif why == c.NEEDS_RIVALS:
+                self._give_rivals(table[first])
             else:
                 self._start(table[first])
 
@@ -194,6 +199,7 @@ class Engine:
         common[[c.C_FRESH, c.C_STARTED]] = 1.0
         common[c.C_STARTS] += 1.0
         common[[c.C_SUSPECTS, c.C_STOOD]] = 0.0
+        common[c.C_RIVAL_TIME] = time
         common[[c.C_FIX_TIME, c.C_TIME, c.C_START_TIME]] = time
         speed, sigma_speed = float(row[c.GNSS_SPEED]), float(row[c.SIGMA_SPEED])
         if not sigma_speed > 0.0:
@@ -220,6 +226,69 @@ class Engine:
                 bank.tags[h, paths.SIGN] = 1 if v >= 0.0 else -1
                 bank.info[h] = -np.inf
                 bank.info[h, paths.FADING] = 0.0
+
+    def _give_rivals(self, row: FloatArray) -> None:
+        """Put a faint hypothesis on every track near the fix that no hypothesis holds.
+
+        A train may have been out of reach of its track when the navigator started, or have crossed over where the model has no
+        turnout. A rival takes over the best hypothesis' motion; what that one thinks of the GNSS error it does not believe. It is
+        worth `rival_prior`, less where the model leads from track to track: there a train would have been seen to cross.
+        """
+        common, bank, settings = self.shared.common, self.bank, self.settings
+        common[c.C_RIVAL_TIME] = float(row[c.TIME])
+        if bank.live[0] >= int(settings.most_hypotheses):
+            return
+        living = self.living()
+        held = {self.place(h)[0] for h in living}
+        best = max(living, key=lambda h: (float(bank.logw[h]), -h))
+        track, offset = self.place(best)
+        point = np.empty(paths.POINT_SIZE)
+        paths.track_point(self.network, track, 1, offset, point)
+        bearing = point[[paths.P_D_EAST, paths.P_D_NORTH]] * float(bank.way[best, bank.tags[best, paths.CURRENT]])
+        around = 3.0 * math.hypot(common[c.C_FRAME_SIGMA], common[c.C_SCALE] * float(row[c.SIGMA_EAST]))
+        found = starting_candidates(
+            self.model,
+            self.network,
+            float(point[paths.P_EAST]),
+            float(point[paths.P_NORTH]),
+            within=min(max(around, 5.0), 30.0),
+            overhang=0.0,
+        )
+        at, n = self.filter.at, self.states
+        blind = [int(at[s]) for s in (State.FRAME_EAST, State.FRAME_NORTH, State.GNSS_EAST, State.GNSS_NORTH)]
+        for start in found:
+            if start.track in held:
+                continue
+            paths.track_point(self.network, start.track, 1, start.offset, point)
+            way = 1 if float(bearing @ point[[paths.P_D_EAST, paths.P_D_NORTH]]) > 0.0 else -1
+            h = paths.take_slot(bank)
+            if h < 0:
+                return
+            local = start.offset if way > 0 else float(self.network.length[start.track]) - start.offset
+            P = bank.P_sqrt[best] @ bank.P_sqrt[best].T
+            P[blind, :] = P[:, blind] = 0.0
+            P[blind[:2], blind[:2]] = common[c.C_FRAME_SIGMA] ** 2
+            P[blind[2:], blind[2:]] = 1.0
+            P[at[State.POSITION], at[State.POSITION]] += 1.0
+            bank.x[h, :n], bank.P_sqrt[h] = bank.x[best], np.linalg.cholesky(P)
+            bank.x[h, blind] = 0.0
+            bank.x[h, at[State.POSITION]] = local
+            usual = {0: 1.0, way: USUAL, -way: 1.0 - USUAL}[int(self.usual[start.track])]
+            before = int(self.usual[track])
+            usual /= 1.0 if before == 0 else USUAL if before == self._way(best) else 1.0 - USUAL
+            linked = self._component[start.track] == self._component[track]
+            bank.logw[h] = bank.logw[best] + math.log(settings.rival_prior * (0.01 if linked else 1.0) * usual)
+            bank.track[h, 0], bank.way[h, 0], bank.begin[h, 0] = start.track, way, 0.0
+            bank.armed[h] = 0
+            bank.tags[h] = bank.tags[best]
+            bank.tags[h, [paths.COUNT, paths.CURRENT]] = 1, 0
+            bank.tags[h, [paths.RECORD, paths.VERSION]] = -1
+            bank.info[h] = bank.info[best]
+            bank.info[h, paths.FADING] = 0.0
+
+    def _way(self, slot: int) -> int:
+        """Direction in which a hypothesis' nose points on its track."""
+        return int(self.bank.way[slot, self.bank.tags[slot, paths.CURRENT]])
 
     def _seed(self, slot: int, local: float, v: float, sigma: float, sigma_v: float) -> None:
         """Fill state and covariance root of a new hypothesis."""
@@ -275,6 +344,16 @@ def _settings_for(model: TrackModel, settings: Settings) -> Settings:
     if not np.isfinite(model.height).any():
         settings = replace(settings, accelerometer_walk=settings.accelerometer_walk + settings.gradient_walk)
     return settings
+
+
+def _components(model: TrackModel) -> IntArray:
+    """Connected part of the network that each track belongs to."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    t, m = len(model.track_id), model.movements
+    links = coo_array((np.ones(len(m)), (m[:, 0], m[:, 2])), shape=(t, t))
+    return np.asarray(connected_components(links, directed=False)[1], np.int64)
 
 
 def _records(n: int, records: int) -> c.Records:

@@ -152,6 +152,8 @@ class Settings:
         How long wheels (or a GNSS speed) must rest before the train is held to stand, s.
     reverse_prior : float
         Prior probability that a train first moves against its nose.
+    rival_prior : float
+        Prior odds, a minute, that the train is on a track nearby that no hypothesis holds and the model does not lead to.
     track_confidence : float
         Posterior at which a track is declared; below it the mode is ambiguous.
     coasting_after : float
@@ -219,6 +221,7 @@ class Settings:
     standstill_sigma: float = 0.02
     standstill_time: float = 1.0
     reverse_prior: float = 0.02
+    rival_prior: float = 1e-3
     track_confidence: float = 0.99
     coasting_after: float = 3.0
     lost_sigma: float = 500.0
