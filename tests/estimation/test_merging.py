@@ -453,3 +453,24 @@ def test_wrong_input_is_named() -> None:
         change_test(short, short)
     with pytest.raises(EstimationError, match="with covariances"):
         change_test(short, solve_chain(random_chain(15), covariance=False), window=2)
+
+
+def test_line_that_moved_as_a_whole_and_line_of_one_window() -> None:
+    def level(offset: np.ndarray) -> object:
+        return solve_chain(Chain([[1e3]], 1e3 * offset[:, None], [[-1e3]], [[1e3]], 1e3 * np.diff(offset)[:, None]))
+
+    for N in (81, 2003):
+        flat = level(np.zeros(N))
+        assert change_test(flat, level(np.full(N, 0.1))).stretches == ((0, N - 1),)
+        assert change_test(flat, flat).stretches == ()
+        assert not change_test(flat, flat).nodes().any()
+    offset = np.zeros(2003)
+    offset[300:340] = offset[1500:1900] = 0.05
+    test = change_test(level(np.zeros(2003)), level(offset))
+    (a, b), (c, d) = test.stretches
+    assert abs(a - 300) < 12
+    assert abs(b - 340) < 12
+    assert abs(c - 1500) < 20
+    assert abs(d - 1900) < 20
+    assert test.nodes(margin=20)[[300, 339, 1500, 1899]].all()
+    assert not test.nodes(margin=20)[[0, 200, 800, 2000]].any()
