@@ -117,7 +117,9 @@ def read(name: str, path: str) -> None:
     from railnav.io.gnss_log import read_log
 
     times = []
+    log = None
     for _ in range(3):
+        del log
         begin = time.perf_counter()
         log = read_log(path, name, start=START)
         times.append(time.perf_counter() - begin)

@@ -129,7 +129,8 @@ class GnssLog:
 class Found:
     """What a reader collects on its way through a log; `settle` turns it into a GnssLog.
 
-    `stamp` is in ns since 1970, on GPS time where `gps_time`, else UTC. `better` ranks fixes of one instant.
+    `stamp` is in ns since 1970, on GPS time where `gps_time`, else UTC. `better` ranks fixes
+    of one instant, larger is better, and is only asked where there are such.
     """
 
     file: Path
@@ -138,7 +139,7 @@ class Found:
     stamp: IntArray
     number: dict[str, FloatArray]
     row: IntArray
-    better: FloatArray
+    better: Callable[[], FloatArray]
     gps_time: bool = False
     good: int = 0
     broken: int = 0
@@ -174,7 +175,7 @@ def read_log(path: str | Path, format: str, *, start: datetime) -> GnssLog:  # n
 
     Notes
     -----
-    The log is read in blocks of 2 MB: memory grows with the fixes kept, about 120 bytes each, not with the file. A log that is
+    The log is read in blocks of 2 MB: memory grows with the fixes kept, about 170 bytes each, not with the file. A log that is
     displaced by whole roll-overs of 1,024 GPS weeks (a receiver with old firmware) is put right when it then starts within a
     day of `start`, and a note says so. Summaries that are not clean are also logged as a warning to "railnav.io".
 
@@ -251,19 +252,22 @@ def settle(found: Found, start: int) -> GnssLog:
         before, now = (gnss_time.calendar(int(stamp[i])) for i in (index - 1, index))
         cause = f"time runs backwards ({now} after {before})"
         raise RunError(cause, file=file, row=_row(found, index), remedy="split the log where the clock was set back")
-    keep = _best(stamp, found.better)
-    duplicates = found.duplicates + len(stamp) - len(keep)
-    number = {"time_s": freeze((stamp[keep] - start) / gnss_time.SECOND)}
+    keep = _best(stamp, found.better) if (stamp[1:] == stamp[:-1]).any() else None
+    number: dict[str, FloatArray] = {}
     for name in list(found.number):
         values = found.number.pop(name)
         if not np.isnan(values).all():
-            number[name] = freeze(values if len(keep) == len(stamp) else values[keep])
-    row = found.row[keep]
+            number[name] = freeze(values if keep is None else values[keep])
+    duplicates, row = found.duplicates, found.row
+    if keep is not None:
+        duplicates += len(stamp) - len(keep)
+        stamp, row = stamp[keep], row[keep]
+    number = {"time_s": freeze((stamp - start) / gnss_time.SECOND)} | number
     summary = LogSummary(
         file=file,
         format=found.format,
         unit=found.unit,
-        fixes=len(keep),
+        fixes=len(stamp),
         good=found.good,
         broken=found.broken,
         first_broken=found.first_broken,
@@ -272,58 +276,69 @@ def settle(found: Found, start: int) -> GnssLog:
         counts={kind: count for kind, count in found.counts.items() if count},
         notes=tuple(found.notes),
     )
-    return GnssLog(Table(file, len(keep), number, error=RunError, row_of=lambda index: int(row[index])), summary)
+    return GnssLog(Table(file, len(stamp), number, error=RunError, row_of=lambda index: int(row[index])), summary)
 
 
 def _row(found: Found, index: int) -> int | None:
     return None if found.format == "ubx" else int(found.row[index])
 
 
-def _best(stamp: IntArray, better: FloatArray) -> IntArray:
+def _best(stamp: IntArray, better: Callable[[], FloatArray]) -> IntArray:
     """Indices of one row an instant: the best, the first of equals. Stamps do not fall."""
-    new = np.concatenate([[True], stamp[1:] > stamp[:-1]])
-    if new.all():
-        return np.arange(len(stamp))
-    group = np.cumsum(new)
-    order = np.lexsort((np.arange(len(stamp)), -better, group))
+    group = np.cumsum(np.concatenate([[True], stamp[1:] > stamp[:-1]]))
+    order = np.lexsort((np.arange(len(stamp)), -better(), group))
     first = np.concatenate([[True], group[order][1:] != group[order][:-1]])
     return np.asarray(order[first], dtype=np.int64)
 
 
-def rank(
-    quality: FloatArray, satellites: FloatArray | None, hdop: FloatArray | None, order: Mapping[int, int]
-) -> FloatArray:
-    """Order fixes of one instant: by kind of fix (`order` of the quality), then satellites, then smaller HDOP."""
-    better = np.zeros(len(quality))
-    for value, place in order.items():
-        better[quality == value] = place * 1e6
-    if satellites is not None:
-        better += 1e3 * np.clip(np.nan_to_num(satellites), 0, 999)
-    if hdop is not None:
-        better -= np.clip(np.nan_to_num(hdop, nan=99.0), 0, 99)
+def rank(number: Mapping[str, FloatArray], order: Mapping[int, int]) -> FloatArray:
+    """Order fixes of one instant: by kind of fix (`order` of the quality), satellites, smaller HDOP, smaller sigma."""
+    better = np.zeros(len(number["latitude_deg"]))
+    if "quality" in number:
+        for value, place in order.items():
+            better[number["quality"] == value] = place * 1e9
+    for name, weight, unknown, limit in (
+        ("satellites", 1e6, 0.0, 999.0),
+        ("hdop", -1e3, 99.0, 99.0),
+        ("sigma_east_m", -1.0, 99.0, 99.0),
+    ):
+        if name in number:
+            better += weight * np.clip(np.nan_to_num(number[name], nan=unknown), 0, limit)
     return better
 
 
 class Gathered:
-    """Columns that grow block by block; a column that stays empty costs nothing."""
+    """Columns that grow block by block; a column that stays empty costs nothing.
+
+    A column grows in place where the system can move its pages, so that it never stands in memory twice.
+    """
 
     def __init__(self, names: Iterable[str]) -> None:
         self.names = tuple(names)
-        self.pieces: list[list[NDArray[Any] | int]] = [[] for _ in self.names]
+        self.columns: dict[str, NDArray[Any]] = {}
+        self.length = 0
 
     def add(self, rows: NDArray[Any]) -> None:
         """Keep a copy of rows (k, columns)."""
-        for piece, column in zip(self.pieces, rows.T, strict=True):
-            empty = rows.dtype.kind == "f" and bool(np.isnan(column).all())
-            piece.append(len(column) if empty else column.copy())
+        end = self.length + len(rows)
+        for name, new in zip(self.names, rows.T, strict=True):
+            column = self.columns.get(name)
+            if column is None:
+                if len(rows) == 0 or (rows.dtype.kind == "f" and bool(np.isnan(new).all())):
+                    continue
+                column = self.columns[name] = np.empty(end, dtype=rows.dtype)
+                column[: self.length] = 0 if rows.dtype.kind == "i" else np.nan
+            if end > len(column):
+                column.resize(max(end, len(column) + len(column) // 2), refcheck=False)  # nobody else holds it
+            column[self.length : end] = new
+        self.length = end
 
     def take(self, name: str) -> NDArray[Any] | None:
-        """Give a whole column and let go of its pieces; None where it holds nothing."""
-        place = self.names.index(name)
-        piece, self.pieces[place] = self.pieces[place], []
-        if all(isinstance(part, int) for part in piece):
-            return None
-        return np.concatenate([np.full(part, np.nan) if isinstance(part, int) else part for part in piece])
+        """Give a whole column away; None where it holds nothing."""
+        column = self.columns.pop(name, None)
+        if column is not None:
+            column.resize(self.length, refcheck=False)
+        return column
 
 
 def through(path: Path, step: Callable[[ByteArray, bool], int]) -> None:

@@ -129,6 +129,8 @@ def days(of_day: IntArray, day: IntArray, start: int) -> tuple[IntArray, bool]:
     >>> days(late, np.array([-1, -1, -1]), 10 * DAY + 23 * 3600 * SECOND)[0].tolist()
     [10, 10, 11]
     """
+    if (day >= 0).all():
+        return day, True
     step = np.diff(of_day)
     turn = np.concatenate([[0], np.cumsum((step < -DAY // 2).astype(np.int64) - (step > DAY // 2))])
     known = np.flatnonzero(day >= 0)

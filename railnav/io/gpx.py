@@ -205,14 +205,11 @@ def scan(path: Path, start: int) -> Found:  # noqa: ARG001 - the points state th
         stamp=none if stamp is None else stamp,
         number=number,
         row=none if row is None else row,
-        better=np.empty(0),
+        better=lambda: rank(number, ORDER),
         good=track.count,
         void=track.void,
         counts={"trkpt": track.count},
     )
-    if len(found.stamp):
-        quality = number.get("quality", np.zeros(len(found.stamp)))
-        found.better = rank(quality, number.get("satellites"), number.get("hdop"), ORDER)
     if track.no_height:
         found.notes.append(f"{track.no_height} heights above sea level come without geoidheight and are left out")
     return found

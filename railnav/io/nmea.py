@@ -64,7 +64,7 @@ def scan(path: Path, start: int) -> Found:
         stamp=of_day,
         number=number,
         row=row,
-        better=np.empty(0),
+        better=lambda: rank(number, ORDER),
         good=int(count[_kernels.GOOD]),
         broken=int(count[_kernels.BROKEN]),
         first_broken=int(count[_kernels.FIRST_BROKEN]) if count[_kernels.BROKEN] else None,
@@ -77,10 +77,6 @@ def scan(path: Path, start: int) -> Found:
         found.stamp = day * gnss_time.DAY + of_day
         if not stated:
             found.notes.append("no sentence states the date; the day nearest to run.start was taken")
-        quality = number.get("quality")
-        found.better = rank(
-            np.zeros(len(row)) if quality is None else quality, number.get("satellites"), number.get("hdop"), ORDER
-        )
     if count[_kernels.NO_HEIGHT]:
         found.notes.append(
             f"{count[_kernels.NO_HEIGHT]} heights above the geoid come without its separation and are left out"

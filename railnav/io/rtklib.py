@@ -94,7 +94,7 @@ def scan(path: Path, start: int) -> Found:  # noqa: ARG001 - the file knows its 
         stamp=stamped - _JST if names[0] == "JST" else stamped,
         number=number,
         row=row,
-        better=rank(number["quality"], number.get("satellites"), None, ORDER) if len(row) else np.empty(0),
+        better=lambda: rank(number, ORDER),
         gps_time=names[0] == "GPST",
         good=int(count[_kernels.GOOD]),
         broken=int(count[_kernels.BROKEN]),

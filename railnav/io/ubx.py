@@ -69,11 +69,6 @@ def scan(path: Path, start: int) -> Found:  # noqa: ARG001 - the messages state 
     through(path, step)
     byte = _integers(stamps, "byte")
     number = {name: values for name in COLUMNS if (values := numbers.take(name)) is not None}
-    better = np.empty(0)
-    if len(byte):
-        sigma = number.get("sigma_east_m")
-        finer = np.zeros(len(byte)) if sigma is None else np.clip(np.nan_to_num(sigma, nan=1e3), 0, 1e3)
-        better = rank(number["quality"], None, None, ORDER) - finer
     return Found(
         file=path,
         format="ubx",
@@ -81,7 +76,7 @@ def scan(path: Path, start: int) -> Found:  # noqa: ARG001 - the messages state 
         stamp=_integers(stamps, "stamp"),
         number=number,
         row=byte,
-        better=better,
+        better=lambda: rank({name: number[name] for name in number if name != "satellites"}, ORDER),
         good=int(count[_kernels.GOOD]),
         broken=int(count[_kernels.BROKEN]),
         first_broken=int(count[_kernels.FIRST_BROKEN]) if count[_kernels.BROKEN] else None,
