@@ -13,6 +13,7 @@ rotates; no normal equations, no difference of covariances.
   where something moved, `aged` and `forgotten` let go; `observe_between` takes fixes between nodes, `reverse_chain` the other
   direction.
 - **Groups.** `group_least_squares` finds unknowns group by group, by projections kept as orthonormal bases.
+- **Networks.** `adjust_network` holds vectors between points (GNSS baselines) to known points; `network_loops` closes their loops.
 - **Covariance roots.** `predict`, `update`, `smooth` on P_sqrt (lower triangular, positive diagonal, P = P_sqrt P_sqrt^T);
   `inverse_root` whitens, `lower_root` takes roots, `repair_covariance` mends rounding. Compiled loops elsewhere call
   `predict_kernel`, `innovation_variance_kernel`, `update_scalar_kernel`, `update_kernel` and `smooth_kernel` of
@@ -59,6 +60,7 @@ from railnav.estimation.merging import (
     observe_between,
     reverse_chain,
 )
+from railnav.estimation.network import Loop, NetworkSolution, adjust_network, network_loops
 from railnav.estimation.screening import Screening, Verdict, screen_chain
 from railnav.estimation.square_root import (
     RepairedCovariance,
@@ -89,6 +91,8 @@ __all__ = [
     "GeometricTest",
     "GroupSolution",
     "IncrementDrift",
+    "Loop",
+    "NetworkSolution",
     "PlanarCurve",
     "RepairedCovariance",
     "Screening",
@@ -96,6 +100,7 @@ __all__ = [
     "SweepResult",
     "Update",
     "Verdict",
+    "adjust_network",
     "block_test",
     "change_test",
     "chi_square_limit",
@@ -113,6 +118,7 @@ __all__ = [
     "lower_root",
     "merge_chain",
     "nees",
+    "network_loops",
     "observe_between",
     "predict",
     "repair_covariance",
