@@ -16,7 +16,10 @@ from railnav.cli._verb import Failure, describe
 #: Each verb's module and its one line in `railnav --help`, in the order of the work.
 VERBS: dict[str, tuple[str, str]] = {
     "demo": ("demo", "Simulate a survey and a service run, build, navigate, evaluate, and write a report."),
-    "import": ("import_", "Turn a track network (GeoJSON, LandXML or elements CSV) into a reference track model."),
+    "import": (
+        "import_",
+        "Turn a track network (OpenStreetMap, GeoJSON, LandXML, elements CSV) into a reference track model.",
+    ),
     "build": ("build", "Build a reference track model from survey runs."),
     "navigate": ("navigate", "Place a run on a model: track, offset, speed, and how sure that is."),
     "evaluate": ("evaluate", "Compare a solution with the truth: errors along and across, track selection, integrity."),

@@ -31,12 +31,13 @@ def command(
     spacing: float,
     as_json: bool,
 ) -> None:
-    """Turn a track network (GeoJSON, LandXML or elements CSV) into a reference track model.
+    """Turn a track network (OpenStreetMap, GeoJSON, LandXML, elements CSV) into a reference track model.
 
     GeoJSON (.geojson, .json): one LineString a track, in WGS 84, property `track`. Elements (.csv, .parquet): straights, arcs
     and clothoids with the coordinates of their start; --crs names their plane. LandXML 1.2 (.xml): alignments with profile,
     cant and station equations, joined where one ends on another; --crs names their plane. Axis tables (.csv with the
-    columns n, s, ds, R, cl, tang, rw, hw): points of alignment, joined likewise.
+    columns n, s, ds, R, cl, tang, rw, hw): points of alignment, joined likewise. OpenStreetMap (.osm.pbf): rail, light rail,
+    underground, tram and narrow gauge with the movements of switches and crossings, mile posts and tunnels, good to a metre.
 
     \b
     Example:
@@ -63,6 +64,12 @@ def command(
 
         read_table = read_axis_table if _files.columns(source) >= AXIS_COLUMNS else read_elements
         model = read_table(source, crs=_plane(source, request), spacing=spacing)
+    elif source.name.lower().endswith(".osm.pbf"):
+        from railnav.cli._terminal import progress
+        from railnav.io.osm import read_osm
+
+        with progress() as tell:
+            model = read_osm(source, **request, spacing=spacing, progress=tell)
     elif ending == ".xml":
         from railnav.io.landxml import read_landxml
 
@@ -71,7 +78,7 @@ def command(
         raise InputError(
             "a network of this ending cannot be imported",
             file=source,
-            remedy="use .geojson, .json, LandXML .xml or elements .csv or .parquet",
+            remedy="use .osm.pbf, .geojson, .json, LandXML .xml, or elements .csv or .parquet",
         )
     model.to_file(output)
     facts = describe_model(model)

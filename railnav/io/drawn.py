@@ -1,0 +1,188 @@
+"""Drawn lines: polylines of metre accuracy become straights joined by arcs, never further from the drawing than stated.
+
+A cubic spline through the vertices of a drawn line swings out beside every kink. Here each corner is cut by the arc that
+touches both segments and passes the vertex at no more than `within`, so the curve stays inside the drawn corner; at the ends a
+stated direction is met by two arcs that leave the first segment by no more than `within`. Directions are continuous and so
+are positions; curvature steps from arc to arc.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railnav.geodesy.grid import GridFrame
+from railnav.track.alignment import KnotTable
+from railnav.units import wrap_angle
+
+FloatArray = NDArray[np.float64]
+
+#: Turns smaller than this are none, rad.
+_NO_TURN = 1e-9
+#: A stated end direction is met where that needs no radius below this, m.
+SHARPEST_BLEND = 15.0
+#: And turns by less than this, rad.
+LARGEST_BLEND = np.radians(20.0)
+
+
+def round_lines(
+    frame: GridFrame,
+    lines: Sequence[FloatArray],
+    *,
+    start_bearing: FloatArray | None = None,
+    end_bearing: FloatArray | None = None,
+    within: float = 0.3,
+    spacing: float = 1.0,
+) -> list[KnotTable]:
+    """Round drawn lines and tabulate each by true ground length; no heights, lengths are horizontal at height 0.
+
+    Parameters
+    ----------
+    frame : GridFrame
+        Plane of the vertices.
+    lines : sequence of (n, 2) array
+        Easting and northing of at least two vertices, no two neighbours at one place, m.
+    start_bearing, end_bearing : (l,) array, optional
+        Grid bearings wanted at the ends as the line runs, rad; NaN where the drawn direction stands. One that would need a
+        radius below 15 m or a turn over 20 degrees is not met.
+    within : float
+        Greatest distance of the curve from the drawn line, m.
+    spacing : float
+        Wanted distance between knots, m.
+
+    Returns
+    -------
+    list of KnotTable
+        One a line.
+
+    Examples
+    --------
+    >>> from railnav.geodesy.grid import frame_for_grid
+    >>> plane = frame_for_grid(3.5e6, 5.6e6, crs="EPSG:31467")
+    >>> corner = np.array([[3.5e6, 5.6e6], [3.5e6, 5600100.0], [3500010.0, 5600200.0]])
+    >>> (table,) = round_lines(plane, [corner])
+    >>> bool(np.abs(table.easting - 3.5e6)[table.northing < 5600050.0].max() < 1e-6)
+    True
+    """
+    count = np.array([len(line) for line in lines])
+    absent = np.full(len(lines), np.nan)
+    tau0 = absent if start_bearing is None else start_bearing
+    tau1 = absent if end_bearing is None else end_bearing
+    vertex = np.concatenate(lines)
+    of_vertex = np.repeat(np.arange(len(lines)), count)
+    inside = of_vertex[1:] == of_vertex[:-1]  # steps that are segments
+    step = np.diff(vertex, axis=0)[inside]
+    origin = vertex[:-1][inside]
+    line = of_vertex[:-1][inside]
+    length = np.hypot(step[:, 0], step[:, 1])
+    unit = step / length[:, None]
+    bearing = np.arctan2(step[:, 0], step[:, 1])
+    last = np.append(line[1:] != line[:-1], True)
+    first = np.append(True, last[:-1])
+
+    # corners: between a segment and the next of the same line
+    phi = np.append(wrap_angle(np.diff(bearing)), 0.0)
+    phi[last] = 0.0
+    phi[np.abs(phi) < _NO_TURN] = 0.0
+    reach = within / np.maximum(np.tan(np.abs(phi) / 4.0), 1e-12)
+    cut = np.minimum(np.minimum(length, np.append(length[1:], np.inf)) / 2.0, reach)
+    cut[phi == 0.0] = 0.0
+    cut_before = np.append(0.0, cut[:-1])
+
+    # ends: directions wanted there
+    def blend(wanted: FloatArray, at: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+        delta = np.where(at, wrap_angle(bearing - np.nan_to_num(wanted[line])), 0.0)
+        delta[np.isnan(wanted[line]) | (np.abs(delta) < _NO_TURN) | (np.abs(delta) > LARGEST_BLEND)] = 0.0
+        run = np.minimum(length / 2.0, 6.0 * within / np.maximum(np.abs(delta), 1e-12))  # swings out by delta run / 6
+        delta[run < 3.0 * np.abs(delta) * SHARPEST_BLEND] = 0.0
+        return delta, np.where(delta == 0.0, 0.0, run)
+
+    delta0, run0 = blend(tau0, first)
+    delta1, run1 = blend(tau1, last)
+
+    # six pieces a segment: two arcs in, straight, two arcs out, corner; each with start, bearing, turn, length
+    pieces = np.zeros((len(length), 6, 5))
+
+    def put(k: int, point: FloatArray, direction: FloatArray, turn: FloatArray, chord: FloatArray) -> None:
+        half = np.where(turn == 0.0, 1.0, turn / 2.0)
+        pieces[:, k, 0:2] = point
+        pieces[:, k, 2] = direction
+        pieces[:, k, 3] = turn
+        pieces[:, k, 4] = np.where(turn == 0.0, chord, chord * half / np.sin(half))
+
+    def ahead(point: FloatArray, direction: FloatArray, chord: FloatArray) -> FloatArray:
+        return np.asarray(point + chord[:, None] * np.column_stack([np.sin(direction), np.cos(direction)]))
+
+    chord = run0 / (2.0 * np.cos(delta0 / 4.0))
+    put(0, origin, bearing - delta0, 1.5 * delta0, chord)
+    put(1, ahead(origin, bearing - delta0 / 4.0, chord), bearing + delta0 / 2.0, -delta0 / 2.0, chord)
+    begin, end = np.maximum(run0, cut_before), length - np.maximum(run1, cut)
+    put(2, origin + begin[:, None] * unit, bearing, np.zeros(len(length)), np.maximum(end - begin, 0.0))
+    chord = run1 / (2.0 * np.cos(delta1 / 4.0))
+    leave = origin + (length - run1)[:, None] * unit
+    put(3, leave, bearing, delta1 / 2.0, chord)
+    put(4, ahead(leave, bearing + delta1 / 4.0, chord), bearing + delta1 / 2.0, -1.5 * delta1, chord)
+    put(5, origin + (length - cut)[:, None] * unit, bearing, phi, 2.0 * cut * np.cos(phi / 2.0))
+    owner = np.repeat(line, 6)
+    flat = pieces.reshape(-1, 5)
+    kept = flat[:, 4] > 1e-9
+    return _tabulate(frame, flat[kept], owner[kept], len(lines), spacing)
+
+
+def _tabulate(
+    frame: GridFrame, pieces: FloatArray, owner: NDArray[np.int64], lines: int, spacing: float
+) -> list[KnotTable]:
+    """Knots of straights and arcs (start easting, northing, bearing, turn, grid length) by line."""
+    east, north, bearing, turn, length = pieces.T
+
+    def point(which: NDArray[np.int64], share: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        half = 0.5 * turn[which] * share
+        chord = share * length[which] * np.sinc(half / np.pi)
+        direction = bearing[which] + half
+        return east[which] + chord * np.sin(direction), north[which] + chord * np.cos(direction), direction + half
+
+    every = np.arange(len(length))
+    at_end = point(every, np.ones(len(length)))
+    level = np.zeros(len(length))
+    scale0 = frame.ground_scale(east, north, level, bearing)
+    scale1 = frame.ground_scale(at_end[0], at_end[1], level, at_end[2])
+    run = np.append(0.0, np.cumsum(2.0 * length / (scale0 + scale1)))  # ground metres, all lines one after another
+    begin = np.searchsorted(owner, np.arange(lines), side="left")
+    finish = np.searchsorted(owner, np.arange(lines), side="right")
+    total = run[finish] - run[begin]
+    n = np.maximum(2, np.rint(total / spacing).astype(np.int64) + 1)
+    before = np.append(0, np.cumsum(n))
+    of = np.repeat(np.arange(lines), n)
+    share = (np.arange(before[-1]) - before[of]) / (n[of] - 1)
+    offset = share * total[of]
+    along = np.minimum(run[begin][of] + offset, run[finish][of])
+    which = np.clip(np.searchsorted(run, along, side="right") - 1, begin[of], finish[of] - 1)
+    part = np.clip((along - run[which]) / (run[which + 1] - run[which]), 0.0, 1.0)
+    e, north_, b = point(which, part)
+    scale = scale0[which] + part * (scale1[which] - scale0[which])
+    curvature = turn[which] / length[which] * scale
+    nothing = np.zeros(int(n.max()))
+    unknown = np.full(int(n.max()), np.nan)
+    unknowns = np.full((int(n.max()), 6), np.nan)
+    b = wrap_angle(b)
+    tables = []
+    for i in range(lines):
+        own = slice(int(before[i]), int(before[i + 1]))
+        m = int(n[i])
+        tables.append(
+            KnotTable(
+                offset[own],
+                e[own],
+                north_[own],
+                unknown[:m],
+                b[own],
+                curvature[own],
+                nothing[:m],
+                nothing[:m],
+                scale[own],
+                unknowns[:m],
+            )
+        )
+    return tables
