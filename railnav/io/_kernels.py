@@ -261,7 +261,7 @@ def nmea_close(slot, slot_row, i, count, out, stamp, n):  # epoch i -> number of
     """Write an epoch that has a position; carry the date on."""
     time = slot[i, S_TIME]
     slot[i, S_ORDER] = 0
-    void = slot[i, S_STATUS] < 0 or slot[i, S_SOURCE] == 0
+    void = slot[i, S_STATUS] < 0 or slot[i, S_SOURCE] == 0 or (slot[i, S_VOID] == 1 and slot[i, S_SOURCE] < 3)
     if slot[i, S_SOURCE] == 0 and slot[i, S_VOID] == 0 and slot[i, S_STATUS] >= 0:
         return 0  # no word about a position
     if void:

@@ -184,9 +184,11 @@ def test_void_fixes_are_skipped_and_counted(log):
         sentence("GNRMC,,V,,,,,,,,,,N"),
         gga("103520.00"),
         rmc("103521.00", status="V") + gga("103521.00"),
+        rmc("103522.00") + gga("103522.00", quality="0"),
+        gga("103523.00") + gga("103523.00", quality="0", talker="GL"),
     )
-    assert read.table.number["time_s"].tolist() == [3.0]
-    assert (read.summary.void, read.summary.broken) == (4, 0)
+    assert read.table.number["time_s"].tolist() == [3.0, 6.0]
+    assert (read.summary.void, read.summary.broken) == (5, 0)
 
 
 def test_of_two_fixes_at_one_instant_the_better_is_kept(log):

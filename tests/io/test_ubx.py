@@ -265,6 +265,7 @@ def test_refusals(log):
 
 def test_blocks_change_nothing(log, monkeypatch):
     messages = [part for i in range(400) for part in (pvt(i, lat=40 + i / 1e4), cov(i), dop(i), b"junk\xb5")]
+    messages.insert(-8, pvt(399)[:50] + b"x")  # broken, far behind the first block
     whole = log(*messages)
     for size in (65_600, 70_003):
         monkeypatch.setattr(gnss_log, "BLOCK", size)
@@ -272,7 +273,8 @@ def test_blocks_change_nothing(log, monkeypatch):
         monkeypatch.setattr("railnav.io.ubx._ROOM", 50)
         pieces = log(*messages)
         assert pieces.summary == whole.summary
-        assert whole.summary.fixes == 400
+        assert (whole.summary.fixes, whole.summary.broken) == (400, 1)
+        assert whole.summary.first_broken > 70_003
         for name, values in whole.table.number.items():
             np.testing.assert_array_equal(pieces.table.number[name], values)
 
