@@ -27,6 +27,8 @@ IntArray = NDArray[np.int64]
 
 #: Hypotheses that fit at a time (more than are kept, for those at a start or a fan of turnouts), and tracks in a window.
 SLOTS, WINDOW = 48, 12
+#: Most that a rival can gain or lose by the GNSS error that the train on its track would have, nat.
+RIVAL_CREDIT = 6.0
 
 
 class Engine:
@@ -232,7 +234,8 @@ class Engine:
 
         A train may have been out of reach of its track when the navigator started, or have crossed over where the model has no
         turnout. A rival takes over the best hypothesis' motion; what that one thinks of the GNSS error it does not believe. It is
-        worth `rival_prior`, less where the model leads from track to track: there a train would have been seen to cross.
+        worth `rival_prior`, less where the model leads from track to track: there a train would have been seen to cross; times how
+        much likelier the GNSS error is if the train is here rather than there.
         """
         common, bank, settings = self.shared.common, self.bank, self.settings
         common[c.C_RIVAL_TIME] = float(row[c.TIME])
@@ -254,8 +257,11 @@ class Engine:
             within=min(max(around, 5.0), 30.0),
             overhang=0.0,
         )
+        here = point[[paths.P_EAST, paths.P_NORTH]].copy()
         at, n = self.filter.at, self.states
         blind = [int(at[s]) for s in (State.FRAME_EAST, State.FRAME_NORTH, State.GNSS_EAST, State.GNSS_NORTH)]
+        spread = common[c.C_SCALE] * settings.gnss_correlated_share * row[[c.SIGMA_EAST, c.SIGMA_NORTH]]
+        error = bank.x[best, blind[:2]] + spread * bank.x[best, blind[2:]]
         for start in found:
             if start.track in held:
                 continue
@@ -276,8 +282,13 @@ class Engine:
             usual = {0: 1.0, way: USUAL, -way: 1.0 - USUAL}[int(self.usual[start.track])]
             before = int(self.usual[track])
             usual /= 1.0 if before == 0 else USUAL if before == self._way(best) else 1.0 - USUAL
+            error_there = error + here - point[[paths.P_EAST, paths.P_NORTH]]
+            variance = spread**2 + common[c.C_FRAME_SIGMA] ** 2
+            likelier = float(np.clip(0.5 * np.sum((error**2 - error_there**2) / variance), -RIVAL_CREDIT, RIVAL_CREDIT))
             linked = self._component[start.track] == self._component[track]
-            bank.logw[h] = bank.logw[best] + math.log(settings.rival_prior * (0.01 if linked else 1.0) * usual)
+            bank.logw[h] = (
+                bank.logw[best] + likelier + math.log(settings.rival_prior * (0.01 if linked else 1.0) * usual)
+            )
             bank.track[h, 0], bank.way[h, 0], bank.begin[h, 0] = start.track, way, 0.0
             bank.armed[h] = 0
             bank.tags[h] = bank.tags[best]

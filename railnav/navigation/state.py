@@ -221,7 +221,7 @@ class Settings:
     standstill_sigma: float = 0.02
     standstill_time: float = 1.0
     reverse_prior: float = 0.02
-    rival_prior: float = 1e-3
+    rival_prior: float = 1e-2
     track_confidence: float = 0.99
     coasting_after: float = 3.0
     lost_sigma: float = 500.0
