@@ -7,6 +7,9 @@ coordinate of that window, the lower-triangular root of its covariance and a log
 from __future__ import annotations
 
 import math
+import zlib
+from pathlib import Path
+from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +22,16 @@ IntArray = NDArray[np.int64]
 #: Parts of a compiled loop: they cannot be called from Python, and count no references to the arrays they are lent, which halves
 #: both the time to compile and the time to run. They must not make arrays.
 part = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)
+
+
+def source_stamp(*modules: ModuleType) -> int:
+    """Checksum of modules' sources: numba's cache watches only the file of the loop, this makes it watch what is compiled in."""
+    stamp = 0
+    for module in modules:
+        if module.__file__ is not None:
+            stamp = zlib.crc32(Path(module.__file__).read_bytes(), stamp)
+    return stamp
+
 
 #: Columns of a packed knot: one cache line of eight doubles. Tangents are grid metres per metre of offset.
 OFFSET, EAST, NORTH, D_EAST, D_NORTH, CURVATURE, GRADIENT, CANT = range(8)

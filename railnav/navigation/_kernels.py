@@ -1,16 +1,19 @@
 """Inner loop of the navigator: all hypotheses, one epoch after the other. Float64 arrays, SI, radians, no validation.
 
-Kernels of `railnav.matching`, `.dynamics`, `.measurements` and `.integrity` are compiled in; numba watches this file only, so that
-its cache must be emptied after a change there.
+Kernels of `railnav.matching`, `.dynamics`, `.measurements` and `.integrity` are compiled in. Numba's cache watches this file only; a
+checksum of the others, which the loop carries as a constant, makes it compile anew when one of them has changed.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
 
+from railnav import units
+from railnav.matching import _kernels as paths
 from railnav.matching._kernels import (
     COUNT,
     CURRENT,
@@ -36,7 +39,9 @@ from railnav.matching._kernels import (
     part,
     path_index,
     path_point,
+    source_stamp,
 )
+from railnav.navigation import columns, state
 from railnav.navigation.columns import (
     ACCELERATION,
     ACCELEROMETER_BIAS,
@@ -172,6 +177,7 @@ from railnav.navigation.columns import (
     WHEEL_DISTANCE,
     WHEEL_SPEED,
 )
+from railnav.navigation.dynamics import _kernels as dynamics
 from railnav.navigation.dynamics._kernels import (
     absorb,
     predict,
@@ -182,7 +188,9 @@ from railnav.navigation.dynamics._kernels import (
     variance_of,
     widen,
 )
+from railnav.navigation.integrity import _kernels as integrity
 from railnav.navigation.integrity._kernels import mixture_bound
+from railnav.navigation.measurements import _kernels as measurements
 from railnav.navigation.measurements._kernels import direction, gravity_pull, motion_rows, position_row, wheel_row
 
 # ---------------------------------------------------------------- what all hypotheses share
@@ -798,25 +806,35 @@ def advance(fil, net, shared, bank, work, records, row, epoch):
         keep_records(bank, work, records, epoch)
 
 
-@njit(cache=True, _nrt=False)
-def run(fil, net, shared, bank, work, records, epochs, first, out):
-    """Work through the epochs from `first`; gives where it stopped and why."""
-    # epochs (m, EPOCH_SIZE), out (m, OUTPUT_SIZE)
-    slots = bank.x.shape[0]
-    usable = fil.settings[K_USABLE]
-    for e in range(first, epochs.shape[0]):
-        row = epochs[e]
-        if records.used[2] == 1 and (
-            records.used[0] + slots > records.x.shape[0] or records.used[1] + slots > records.track.shape[0]
-        ):
-            return e, NEEDS_ROOM
-        seen = row[EAST] == row[EAST] and row[SIGMA_EAST] <= usable and row[SIGMA_NORTH] <= usable
-        if bank.live[0] == 0 and seen and not row[TIME] - shared.common[C_TRY] < 1.0:
-            return e, NEEDS_START
-        if bank.live[0] > 0 and seen and row[TIME] - shared.common[C_RIVAL_TIME] >= RIVAL_INTERVAL:
-            return e, NEEDS_RIVALS
-        watch(fil, shared, row)
-        advance(fil, net, shared, bank, work, records, row, e)
-        remember(shared, row)
-        put_out(fil, net, shared, bank, work, row, out[e])
-    return epochs.shape[0], DONE
+def _compiled(stamp: int) -> Any:
+    """The loop, bound to the checksum of the sources that it is made of."""
+
+    @njit(cache=True, _nrt=False)
+    def run(fil, net, shared, bank, work, records, epochs, first, out):
+        """Work through the epochs from `first`; gives where it stopped and why."""
+        # epochs (m, EPOCH_SIZE), out (m, OUTPUT_SIZE)
+        if stamp < 0:  # never: it makes the checksum part of the cache's key
+            return first, DONE
+        slots = bank.x.shape[0]
+        usable = fil.settings[K_USABLE]
+        for e in range(first, epochs.shape[0]):
+            row = epochs[e]
+            if records.used[2] == 1 and (
+                records.used[0] + slots > records.x.shape[0] or records.used[1] + slots > records.track.shape[0]
+            ):
+                return e, NEEDS_ROOM
+            seen = row[EAST] == row[EAST] and row[SIGMA_EAST] <= usable and row[SIGMA_NORTH] <= usable
+            if bank.live[0] == 0 and seen and not row[TIME] - shared.common[C_TRY] < 1.0:
+                return e, NEEDS_START
+            if bank.live[0] > 0 and seen and row[TIME] - shared.common[C_RIVAL_TIME] >= RIVAL_INTERVAL:
+                return e, NEEDS_RIVALS
+            watch(fil, shared, row)
+            advance(fil, net, shared, bank, work, records, row, e)
+            remember(shared, row)
+            put_out(fil, net, shared, bank, work, row, out[e])
+        return epochs.shape[0], DONE
+
+    return run
+
+
+run = _compiled(source_stamp(paths, columns, state, units, dynamics, integrity, measurements))

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 
+from railnav.estimation import _kernels as estimation
 from railnav.estimation._kernels import smooth_kernel
+from railnav.matching import _kernels as paths
+from railnav.matching._kernels import source_stamp
+from railnav.navigation import columns, state
 from railnav.navigation.columns import (
     FORCE,
     NOISES,
@@ -22,6 +28,7 @@ from railnav.navigation.columns import (
     SPEED,
     TIME,
 )
+from railnav.navigation.dynamics import _kernels as dynamics
 from railnav.navigation.dynamics._kernels import transition, variance_of
 
 
@@ -46,53 +53,63 @@ def window_index(records, version, s):  # path coordinate -> index in a stored w
     return i
 
 
-@njit(cache=True)
-def smooth_lineage(fil, records, epochs, chain, first, last, x, sigma):
-    """Carry the smoothed state back along a lineage (Rauch-Tung-Striebel in square roots, noise as the filter applied it)."""
-    # chain (m,) record by epoch; x (m, n) and sigma (m, 2: position, speed) out
-    n = x.shape[1]
-    i_s, i_v = fil.at[POSITION], fil.at[SPEED]
-    F = np.empty((n, n))
-    Q = np.empty((NOISES, n))
-    lead = np.empty(NOISES, np.int64)
-    new = np.empty(n)
-    gain = np.empty((n, n))
-    state = records.x[chain[last]].copy()
-    P_sqrt = records.P_sqrt[chain[last]].copy()
-    next_state = np.empty(n)
-    next_P = np.empty((n, n))
-    for e in range(last, first - 1, -1):
-        if e < last:
-            r = chain[e]
-            numbers = records.numbers[chain[e + 1]]
+def _compiled(stamp: int) -> Any:
+    """The smoother, bound to the sources that it is made of (see `railnav.navigation._kernels`)."""
+
+    @njit(cache=True)
+    def smooth_lineage(fil, records, epochs, chain, first, last, x, sigma):
+        """Carry the smoothed state back along a lineage (Rauch-Tung-Striebel in square roots, noise as the filter applied it)."""
+        # chain (m,) record by epoch; x (m, n) and sigma (m, 2: position, speed) out
+        if stamp < 0:  # never: it makes the checksum part of the cache's key
+            return
+        n = x.shape[1]
+        i_s, i_v = fil.at[POSITION], fil.at[SPEED]
+        F = np.empty((n, n))
+        Q = np.empty((NOISES, n))
+        lead = np.empty(NOISES, np.int64)
+        new = np.empty(n)
+        gain = np.empty((n, n))
+        state = records.x[chain[last]].copy()
+        P_sqrt = records.P_sqrt[chain[last]].copy()
+        next_state = np.empty(n)
+        next_P = np.empty((n, n))
+        for e in range(last, first - 1, -1):
+            if e < last:
+                r = chain[e]
+                numbers = records.numbers[chain[e + 1]]
+                for i in range(n):
+                    next_state[i] = state[i]
+                    state[i] = records.x[r, i]
+                    for j in range(n):
+                        next_P[i, j] = P_sqrt[i, j]
+                        P_sqrt[i, j] = records.P_sqrt[r, i, j]
+                dt = epochs[e + 1, TIME] - epochs[e, TIME]
+                columns = transition(
+                    fil,
+                    state,
+                    dt,
+                    numbers[R_SIGN],
+                    epochs[e + 1, FORCE],
+                    numbers[R_PULL],
+                    numbers[R_SLIP],
+                    numbers[R_SHAKE],
+                    numbers[R_STEP],
+                    numbers[R_TAG],
+                    F,
+                    Q,
+                    lead,
+                    new,
+                )
+                smooth_kernel(state, P_sqrt, F, np.ascontiguousarray(Q[:columns].T), new, next_state, next_P, gain)
             for i in range(n):
-                next_state[i] = state[i]
-                state[i] = records.x[r, i]
-                for j in range(n):
-                    next_P[i, j] = P_sqrt[i, j]
-                    P_sqrt[i, j] = records.P_sqrt[r, i, j]
-            dt = epochs[e + 1, TIME] - epochs[e, TIME]
-            columns = transition(
-                fil,
-                state,
-                dt,
-                numbers[R_SIGN],
-                epochs[e + 1, FORCE],
-                numbers[R_PULL],
-                numbers[R_SLIP],
-                numbers[R_SHAKE],
-                numbers[R_STEP],
-                numbers[R_TAG],
-                F,
-                Q,
-                lead,
-                new,
-            )
-            smooth_kernel(state, P_sqrt, F, np.ascontiguousarray(Q[:columns].T), new, next_state, next_P, gain)
-        for i in range(n):
-            x[e, i] = state[i]
-        sigma[e, 0] = np.sqrt(variance_of(P_sqrt, i_s))
-        sigma[e, 1] = np.sqrt(variance_of(P_sqrt, i_v))
+                x[e, i] = state[i]
+            sigma[e, 0] = np.sqrt(variance_of(P_sqrt, i_s))
+            sigma[e, 1] = np.sqrt(variance_of(P_sqrt, i_v))
+
+    return smooth_lineage
+
+
+smooth_lineage = _compiled(source_stamp(paths, columns, state, dynamics, estimation))
 
 
 @njit(cache=True)
