@@ -169,6 +169,19 @@ def test_rounding_stays_by_the_drawing_and_does_not_swing_out():
     )
 
 
+def test_a_line_drawn_backwards_is_the_same_curve_backwards():
+    frame = frame_for_grid(3.5e6, 5.6e6, crs="EPSG:31467")
+    drawn = np.add([[0, 0], [0, 40], [20, 100], [25, 300]], (3.5e6, 5.6e6))
+    wanted = np.array([-0.05]), np.array([0.09])
+    (there,) = round_lines(frame, [drawn], start_bearing=wanted[0], end_bearing=wanted[1])
+    (back,) = round_lines(frame, [drawn[::-1]], start_bearing=wanted[1] + np.pi, end_bearing=wanted[0] + np.pi)
+    assert (there.grid_bearing[0], there.grid_bearing[-1]) == pytest.approx((-0.05, 0.09), abs=1e-9)
+    np.testing.assert_allclose(back.offset, there.offset, atol=1e-7)
+    np.testing.assert_allclose(back.easting[::-1], there.easting, atol=1e-6)
+    np.testing.assert_allclose(back.northing[::-1], there.northing, atol=1e-6)
+    np.testing.assert_allclose(np.sin(back.grid_bearing[::-1] - there.grid_bearing), 0.0, atol=1e-7)
+
+
 def test_a_branch_leaves_in_the_direction_of_the_stem(write):
     nodes = {1: (0, -300), 3: (0, 0, {"railway": "switch"}), 4: (0, 200), 5: (3, 50), 6: (20, 200)}
     model = read_osm(write(nodes, [(1, [1, 3, 4], {}), (2, [3, 5, 6], {})]))
