@@ -677,20 +677,24 @@ def pos_block(data, last, meaning, count, out, stamp):  # bytes; column of each 
         inside = False
         for q in range(begin, end):
             c = data[q]
+            if inside and 45 <= c <= 58:
+                continue  # digits and what stands among them
             if c == 32 or c == 9 or c == 44 or c == 59 or c == 13:
-                inside = False
+                if inside:
+                    f[fields - 1, 1] = q
+                    inside = False
             elif fields == 0 and begin == 0 and row == 1 and (c == 239 or c == 187 or c == 191):
                 inside = False  # a byte order mark
             elif not inside:
                 if fields == 0 and c == 37:  # %
                     break
+                if fields > expected:
+                    break
                 inside = True
-                if fields <= expected:
-                    f[fields, 0] = q
-                    f[fields, 1] = q + 1
-                    fields += 1
-            else:
-                f[fields - 1, 1] = q + 1
+                f[fields, 0] = q
+                fields += 1
+        if inside:
+            f[fields - 1, 1] = end
         if fields == 0:
             continue  # blank, or a comment
         if fields != expected:
