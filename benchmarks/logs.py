@@ -3,7 +3,8 @@
 python benchmarks/logs.py [--json] [--peers] [--hours 24]
 
 Logs of a receiver at 10 Hz are written to a temporary folder and read in a fresh process each, three times: the first reading
-loads the compiled parser. Beside the wall clock stands CPU time, for machines that others use too. `--peers` reads a piece of them with pynmeagps and pyubx2, which parse every field of every message.
+loads the compiled parser. Beside the wall clock stands CPU time, for machines that others use too.
+`--peers` reads a piece of them with pynmeagps and pyubx2, which parse every field of every message.
 """
 
 from __future__ import annotations
@@ -190,7 +191,8 @@ def main() -> None:
         beside = f"   usual reader {f['peer_per_second']:,}" if f["peer_per_second"] else ""
         print(
             f"{name:<11} {f['megabytes']:7.1f} MB  {f[UNITS[name]]:>9,} {UNITS[name]:<9} {f['best_s']:7.3f} s  "
-            f"{f['per_second']:>10,}/s, {f['per_cpu_second']:,} a CPU second (limit {f['limit_per_second']:,})  peak {f['peak_mb']} MB{beside}"
+            f"{f['per_second']:>10,}/s, {f['per_cpu_second']:,} a CPU second "
+            f"(limit {f['limit_per_second']:,})  peak {f['peak_mb']} MB{beside}"
         )
 
 
