@@ -56,11 +56,11 @@ PAGES = {
             ),
             Section(
                 "navigate-accuracy",
-                "Navigation",
+                "Navigation of the sample run and of a real line",
                 "The simulated sample run (14 minutes, double line, station siding, two outages; coloured GNSS errors), forward and "
                 "smoothed, and lawful movement on the real line against snapping to the nearest track. The sample's truth counts offsets "
                 "horizontally at height 0, 20 to 73 ppm shorter than ground length: up to 0.55 m of its along-track errors is that.",
-                "python benchmarks/navigate.py --accuracy",
+                "python benchmarks/navigate.py",
                 real_data=True,
             ),
             Section(
@@ -68,6 +68,13 @@ PAGES = {
                 "Navigation of simulated runs over the bundled line",
                 "Many seeds, so that the covariance can be judged: errors along the track, tracks, NEES pooled over runs, coverage.",
                 "python benchmarks/service.py",
+            ),
+            Section(
+                "outages",
+                "Real drive without a map: the loose inertial filter with RTK withheld",
+                "A car with RTK GNSS and a low-cost IMU; the fixes left out are the truth. Causal, no constraints.",
+                "python benchmarks/outages.py",
+                real_data=True,
             ),
         ),
     ),
@@ -104,8 +111,9 @@ PAGES = {
             Section(
                 "navigate-speed",
                 "Navigating",
-                "GNSS epochs a second on the real line after loading, and the time of one live step.",
-                "python benchmarks/navigate.py --speed",
+                "GNSS epochs a second on the real line after loading, and the time of one live step (two trains; the whole line stands "
+                "under accuracy).",
+                "python benchmarks/navigate.py --quick",
                 real_data=True,
             ),
             Section(
@@ -113,6 +121,12 @@ PAGES = {
                 "Strapdown mechanization",
                 "IMU samples a second on one core.",
                 "python benchmarks/strapdown.py",
+            ),
+            Section(
+                "logs",
+                "Reading logs",
+                "Lines, rows and messages a second of simulated logs.",
+                "python benchmarks/logs.py",
             ),
         ),
     ),
