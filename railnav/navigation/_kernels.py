@@ -168,9 +168,7 @@ from railnav.navigation.columns import (
     W_BEFORE,
     W_COLUMN,
     W_F,
-    W_F_NORTH,
     W_H,
-    W_H_NORTH,
     W_KEEP,
     W_MOVE,
     W_NEW,
@@ -479,7 +477,7 @@ def sense_all(fil, net, shared, bank, work, row, dt):
 
 
 @part
-def jump(fil, net, shared, bank, work, row):
+def jump(fil, shared, bank, work):
     """What stepped when fixes have left every hypothesis: variances for the GNSS error (in its own units) and for the time stamps.
 
     A jump along the track that the speed turns into less than `time_tag_most` seconds is one of the stamps.
@@ -489,8 +487,7 @@ def jump(fil, net, shared, bank, work, row):
     for i in range(1, bank.live[0]):
         if work.slot[bank.live[1 + i], S_NIS] < work.slot[best, S_NIS]:
             best = bank.live[1 + i]
-    position_row(fil, net, shared, bank, work, best, row)
-    fix = work.fix
+    fix = work.fix[best]
     te, tn = work.point[best, P_D_EAST], work.point[best, P_D_NORTH]
     size = math.hypot(te, tn)
     along = (fix[0] * te + fix[1] * tn) / size
@@ -514,8 +511,9 @@ def fix_all(fil, net, shared, bank, work, row):
     least = np.inf
     for i in range(bank.live[0]):
         h = bank.live[1 + i]
-        nis, _ = position_row(fil, net, shared, bank, work, h, row)
+        nis, logdet = position_row(fil, net, shared, bank, work, h, row)
         work.slot[h, S_NIS] = nis
+        work.slot[h, S_SAID] = logdet
         least = min(least, nis)
     step = 0.0
     tag = 0.0
@@ -530,7 +528,7 @@ def fix_all(fil, net, shared, bank, work, row):
             common[C_JUMPS] = np.inf  # start anew
             common[C_TRY] = -np.inf
             return False
-        step, tag = jump(fil, net, shared, bank, work, row)
+        step, tag = jump(fil, shared, bank, work)
         common[C_STEPS] += 1.0
         if common[C_GNSS_SPEED] < 0.5 and at[SPEED_LATENCY] >= 0:
             common[C_DISTRUST] = time + DISTRUST
@@ -540,7 +538,6 @@ def fix_all(fil, net, shared, bank, work, row):
     held = START_GATE if fresh else k[K_GATE] + 10.0  # evidence against a hypothesis saturates: a fix may be wrong, too
     most = -np.inf
     i_g = at[GNSS_EAST]
-    h_north, f_east, f_north = work.vector[W_H_NORTH], work.vector[W_F], work.vector[W_F_NORTH]
     keep, move, before = work.vector[W_KEEP], work.vector[W_MOVE], work.vector[W_BEFORE]
     for i in range(bank.live[0]):
         h = bank.live[1 + i]
@@ -552,19 +549,22 @@ def fix_all(fil, net, shared, bank, work, row):
         if tag > 0.0:
             widen(P_sqrt, at[TIME_TAG], math.sqrt(tag), work.vector[W_COLUMN])
             work.slot[h, S_TAG] = tag
-        nis, logdet = position_row(fil, net, shared, bank, work, h, row)
+        nis, logdet = work.slot[h, S_NIS], work.slot[h, S_SAID]
+        if step > 0.0 or tag > 0.0:
+            nis, logdet = position_row(fil, net, shared, bank, work, h, row)
         said = -0.5 * (min(nis, held) + logdet)
         work.slot[h, S_SAID] = said
         most = max(most, said)
         n = x.shape[0]
         for j in range(n):
             before[j] = x[j]
-        absorb(x, P_sqrt, f_east, work.fix[0], work.fix[2], keep, move)
-        innovation = work.fix[1]
+        fix, h_north, f_north = work.fix[h], work.rows[h, 1], work.rows[h, 3]
+        absorb(x, P_sqrt, work.rows[h, 2], fix[0], fix[2], keep, move)
+        innovation = fix[1]
         for j in range(n):
             innovation -= h_north[j] * (x[j] - before[j])
         project(P_sqrt, h_north, f_north)
-        absorb(x, P_sqrt, f_north, innovation, work.fix[3], keep, move)
+        absorb(x, P_sqrt, f_north, innovation, fix[3], keep, move)
     # the evidence of positions fades: errors longer than any correlation time must not add up to certainty
     since = time - common[C_FIX_TIME]
     fade = math.exp(-since / k[K_MEMORY])

@@ -207,7 +207,7 @@ RECORD_SIZE = 10
 PULLS = 6
 
 #: Rows of `Work.vector`.
-W_NEW, W_H, W_H_NORTH, W_F, W_F_NORTH, W_KEEP, W_MOVE, W_COLUMN, W_BEFORE = range(9)
+W_NEW, W_H, W_F, W_KEEP, W_MOVE, W_COLUMN, W_BEFORE = range(7)
 #: Columns of `Work.slot`: what the filter did to a hypothesis (PULLS numbers as in a record), NIS and ln p of the fix, track's posterior.
 S_PULL, S_SLIP, S_SHAKE, S_STEP, S_TAG, S_SIGN, S_NIS, S_SAID, S_MASS = range(9)
 SLOT_SIZE = 9
@@ -247,11 +247,12 @@ class Work(NamedTuple):
     F: FloatArray  # (n, n)
     Q: FloatArray  # (NOISES, n) one noise column a row
     lead: IntArray  # (NOISES,) first row of each noise column
-    vector: FloatArray  # (9, n): W_...
+    vector: FloatArray  # (7, n): W_...
     point: FloatArray  # (slots, POINT_SIZE + 1): geometry at each hypothesis' predicted position, and that position
     probe: FloatArray  # (POINT_SIZE + 1,)
     place: FloatArray  # (4,): antenna and its derivative
-    fix: FloatArray  # (7,): innovation E, N; white variance E, N; innovation covariance EE, NN, EN
+    rows: FloatArray  # (slots, 4, n): rows of the fix E, N, and their projections on each hypothesis' root
+    fix: FloatArray  # (slots, 7): innovation E, N; white variance E, N; innovation covariance EE, NN, EN
     slot: FloatArray  # (slots, SLOT_SIZE): S_...
     mix: FloatArray  # (3, slots): weight, mean, sigma along the track
 

@@ -88,9 +88,7 @@ from railnav.navigation.columns import (
     TIME_TAG,
     W_COLUMN,
     W_F,
-    W_F_NORTH,
     W_H,
-    W_H_NORTH,
     W_KEEP,
     W_MOVE,
     WHEEL_DISTANCE,
@@ -400,9 +398,8 @@ def position_row(fil, net, shared, bank, work, h, row):
     at = fil.at
     k = fil.settings
     x, P_sqrt = bank.x[h], bank.P_sqrt[h]
-    h_east, h_north = work.vector[W_H], work.vector[W_H_NORTH]
-    f_east, f_north = work.vector[W_F], work.vector[W_F_NORTH]
-    point, probe, place, fix = work.point[h], work.probe, work.place, work.fix
+    h_east, h_north, f_east, f_north = work.rows[h, 0], work.rows[h, 1], work.rows[h, 2], work.rows[h, 3]
+    point, probe, place, fix = work.point[h], work.probe, work.place, work.fix[h]
     i_s, i_v, i_g, i_t = at[POSITION], at[SPEED], at[GNSS_EAST], at[TIME_TAG]
     i_fe, i_fn = at[FRAME_EAST], at[FRAME_NORTH]
     n = x.shape[0]
