@@ -70,6 +70,12 @@ PAGES = {
                 "python benchmarks/service.py",
             ),
             Section(
+                "parallel",
+                "Parallel tracks without a turnout, simulated",
+                "Whether the stated track probability is true, and how long deciding takes.",
+                "python benchmarks/parallel.py",
+            ),
+            Section(
                 "outages",
                 "Real drive without a map: the loose inertial filter with RTK withheld",
                 "A car with RTK GNSS and a low-cost IMU; the fixes left out are the truth. Causal, no constraints.",
