@@ -4,8 +4,8 @@ Examples
 --------
 >>> round(kmh(10.0), 6), round(from_kmh(36.0), 6)
 (36.0, 10.0)
->>> round(cant_angle(0.160), 6)
-0.106871
+>>> round(float(cant_angle(0.160)), 5)
+0.10687
 """
 
 from __future__ import annotations
