@@ -67,8 +67,8 @@ PAGES = {
                 "navigate-simulated",
                 "Navigation of simulated runs over the bundled line",
                 "Many seeds, so that the covariance can be judged: errors along the track, tracks, NEES pooled over runs, coverage. On "
-                "this exact model the stated sigma is too large (NEES below its bounds): the navigator allows for errors of surveyed models "
-                "in the place of curves, which this model does not have.",
+                "this exact model the stated sigma is too large (NEES below its bounds): the navigator allows for errors of surveyed "
+                "models in the place of curves, which this model does not have.",
                 "python benchmarks/service.py",
             ),
             Section(

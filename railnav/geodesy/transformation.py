@@ -111,15 +111,19 @@ def pin_operation(source: pyproj.CRS, target: pyproj.CRS, extent: Extent) -> tup
     except ProjError as error:
         raise CrsError(f"PROJ has no transformation from {words()}: {shortened(error)}") from error
     why = "PROJ has none that it can run"
+    usable: list[tuple[str, str, float]] = []
     for transformer in group.transformers:
         definition = str(transformer.definition)
+        # a conversion changes no datum and is exact; PROJ 9.8 states no accuracy for it, earlier ones stated 0
+        parts = transformer.operations or ()
+        exact = bound or (len(parts) > 0 and all(part.type_name == "Conversion" for part in parts))
         if "ballpark" in transformer.description.lower():
             why = "PROJ offers only a ballpark one, which leaves the coordinates as they are"
         elif "grids=" in definition:
             why = "it would need grid files"
         elif "proj=push v_3" in definition:
             why = "it leaves heights as they are, on another ellipsoid"
-        elif transformer.accuracy < 0 and not bound:
+        elif transformer.accuracy < 0 and not exact:
             why = "its accuracy is unknown"
         elif not definition.startswith("proj=") or not transformer.has_inverse:
             why = "it cannot be written down or run backwards"
@@ -127,7 +131,9 @@ def pin_operation(source: pyproj.CRS, target: pyproj.CRS, extent: Extent) -> tup
             operation = (
                 "link to WGS 84 as given with the system" if bound else _plain_operation(transformer.description)
             )
-            return definition, operation, max(float(transformer.accuracy), 0.0)
+            usable.append((definition, operation, max(float(transformer.accuracy), 0.0)))
+    if usable:
+        return min(usable, key=lambda u: u[2])  # the first of equals: PROJ knows the areas
     if not group.transformers and group.unavailable_operations:
         why = "it would need grid files"
     raise CrsError(f"no usable transformation from {words()} about {extent}: {why}; {_remedy(target)}")
@@ -148,9 +154,10 @@ def _remedy(target: pyproj.CRS) -> str:
 
 def _plain_operation(description: str) -> str:
     """An operation's name without the steps that only swap axes or promote dimensions."""
-    steps = [step.strip() for step in description.split(" + ")]
+    plain = description.replace(" (with axis order normalized for visualization)", "")
+    steps = [step.strip() for step in plain.split(" + ")]
     kept = [step for step in steps if not step.startswith(("axis order change", "Null geographic offset"))]
-    return "projection as given, no change of datum" if kept == ["unknown"] else " + ".join(kept) or description
+    return "projection as given, no change of datum" if kept == ["unknown"] else " + ".join(kept) or plain
 
 
 def registered(system: pyproj.CRS) -> tuple[str, int] | None:
