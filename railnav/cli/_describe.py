@@ -373,6 +373,7 @@ def print_evaluation(evaluation: Evaluation, title: str) -> None:
     for name, (columns, rows, left) in (
         ("Errors along by mode", report.mode_rows(evaluation)),
         ("Without GNSS", report.coasting_rows(evaluation)),
+        ("Is the track probability true?", report.reliability_rows(evaluation)),
         ("On a wrong track", report.wrong_rows(evaluation)),
     ):
         print_table(name, columns, rows, left=left)

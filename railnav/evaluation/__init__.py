@@ -4,6 +4,7 @@ from railnav.evaluation.comparison import Comparison, compare
 from railnav.evaluation.consistency import Consistency, consistency, effective_samples, pooled
 from railnav.evaluation.jumps import Jump, Jumps, find_jumps
 from railnav.evaluation.known import truth_as_solution
+from railnav.evaluation.reliability import Reliability, ReliabilityClass, pooled_reliability, reliability
 from railnav.evaluation.scores import (
     CoastingStretch,
     Evaluation,
@@ -22,6 +23,8 @@ __all__ = [
     "Integrity",
     "Jump",
     "Jumps",
+    "Reliability",
+    "ReliabilityClass",
     "Statistics",
     "TrackSelection",
     "WrongStretch",
@@ -31,5 +34,7 @@ __all__ = [
     "evaluate",
     "find_jumps",
     "pooled",
+    "pooled_reliability",
+    "reliability",
     "truth_as_solution",
 ]

@@ -12,6 +12,7 @@ from railnav.errors import InputError
 from railnav.evaluation.comparison import Comparison, compare
 from railnav.evaluation.consistency import NOMINAL_COVERAGE, Consistency, consistency
 from railnav.evaluation.jumps import Jumps, find_jumps
+from railnav.evaluation.reliability import Reliability, reliability
 from railnav.navigation.solution import Mode, Solution
 from railnav.track.model import TrackModel
 from railnav.truth import Truth
@@ -215,6 +216,8 @@ class Evaluation:
     modes : dict of int
         Rows in each mode.
     selection : TrackSelection
+    reliability : Reliability
+        Stated track probabilities against the share of right rows.
     consistency : Consistency
         NEES and coverage along, over rows on the right track.
     integrity : Integrity
@@ -240,6 +243,7 @@ class Evaluation:
     along_by_mode: dict[str, Statistics]
     modes: dict[str, int]
     selection: TrackSelection
+    reliability: Reliability
     consistency: Consistency
     integrity: Integrity
     coasting: tuple[CoastingStretch, ...]
@@ -282,6 +286,7 @@ class Evaluation:
                 "wrong_while_tracking": self.selection.wrong_while_tracking,
                 "wrong": [asdict(w) for w in self.selection.wrong],
             },
+            "reliability": {**asdict(self.reliability), "honest": self.reliability.honest},
             "consistency": {
                 **asdict(self.consistency),
                 "inside": self.consistency.inside,
@@ -378,6 +383,7 @@ def evaluate(
         },
         modes={m.label: int((mode == m).sum()) for m in Mode if (mode == m).any()},
         selection=_selection(solution, truth, c, mode, positioned),
+        reliability=reliability(solution.track_probability[c.row][positioned], c.right[positioned]),
         consistency=consistency(c.along[judged], sigma[judged], c.time[judged], confidence=confidence),
         integrity=_integrity(c.along, level, alert_limit, solution.integrity_risk),
         coasting=_coasting(c, mode, sigma, level),

@@ -686,6 +686,59 @@ def integrity(evaluation: Evaluation) -> Figure:
     return Figure("integrity", data, layout)
 
 
+def reliability(evaluation: Evaluation) -> Figure:
+    """Draw the reliability diagram: the share of rows on the right track against the track probability that they state.
+
+    Each dot is a class of stated probabilities with the bounds of its true share; on the diagonal a probability is true, above it
+    modest, below it overconfident. Both axes count nines: the distance from 1 on a logarithmic scale.
+    """
+    classes = evaluation.reliability.classes
+    least = 1e-4
+
+    def nines(share: float) -> float:
+        return float(-np.log10(max(1.0 - share, least)))
+
+    x = [nines(c.stated) for c in classes]
+    y = [nines(c.right) for c in classes]
+    data: list[dict[str, Any]] = [
+        {
+            "type": "scatter",
+            "mode": "markers",
+            "name": "classes of stated probability",
+            "x": x,
+            "y": y,
+            "error_y": {
+                "type": "data",
+                "symmetric": False,
+                "array": [nines(c.upper) - b for c, b in zip(classes, y, strict=True)],
+                "arrayminus": [b - nines(c.lower) for c, b in zip(classes, y, strict=True)],
+                "color": SOFT,
+                "thickness": 1.2,
+            },
+            "marker": {"size": 9, "color": [ESTIMATE if c.honest else WRONG for c in classes]},
+            "text": [
+                f"stated {100 * c.stated:.2f} %, right {100 * c.right:.2f} % of {c.rows:,} rows ({c.effective:.0f} independent)"
+                for c in classes
+            ],
+            "hovertemplate": "%{text}<extra></extra>",
+        }
+    ]
+    top = nines(1.0)
+    data.append(_line("true", [0, top], [0, top], SOFT, line={"width": 1, "dash": "dash"}, hoverinfo="skip"))
+    ticks = {
+        "tickvals": [nines(s) for s in (0.0, 0.5, 0.9, 0.99, 0.999, 0.9999)],
+        "ticktext": ["0", "50 %", "90 %", "99 %", "99.9 %", "99.99 %"],
+        "range": [-0.15, top + 0.15],
+    }
+    layout = _layout(
+        400,
+        hovermode="closest",
+        xaxis=_axis("track probability stated", **ticks),
+        yaxis=_axis("share of rows on the right track", **ticks),
+    )
+    return Figure("reliability", data, layout)
+
+
 def profile(model: TrackModel, *, tracks: int = len(PALETTE)) -> Figure:
     """Draw curvature, height and cross-track standard deviation along the longest tracks of a model.
 

@@ -395,6 +395,22 @@ def coasting_rows(evaluation: Evaluation) -> tuple[Sequence[str], list[list[str]
     )
 
 
+def reliability_rows(evaluation: Evaluation) -> tuple[Sequence[str], list[list[str]], int]:
+    """Tabulate stated track probabilities against the share of right rows."""
+    rows = [
+        [
+            f"{100 * c.low:g} to {100 * c.high:g} %",
+            f"{c.rows:,}",
+            f"{c.effective:.0f}",
+            f"{100 * c.stated:.2f} %",
+            f"{100 * c.right:.2f} %",
+            f"{100 * c.lower:.2f} to {100 * c.upper:.2f} %",
+        ]
+        for c in evaluation.reliability.classes
+    ]
+    return ("track probability", "epochs", "independent", "mean stated", "right", "95 % bounds"), rows, 1
+
+
 def wrong_rows(evaluation: Evaluation) -> tuple[Sequence[str], list[list[str]], int]:
     """Tabulate the stretches on a wrong track, in order."""
     rows = [
@@ -456,6 +472,15 @@ def _evaluation_sections(
             [figures.integrity(evaluation), Table(*mode_rows(evaluation), caption="Errors along the track by mode")],
         )
     )
+    if evaluation.reliability.classes:
+        sections.append(
+            Section(
+                "Is the track probability true?",
+                "Rows sorted by the track probability that they state, and how many of each class were on the right track. Above "
+                "the line the navigator is modest, below it overconfident; the bars allow for rows that repeat one decision.",
+                [figures.reliability(evaluation), Table(*reliability_rows(evaluation))],
+            )
+        )
     columns, rows, left = coasting_rows(evaluation)
     if rows:
         sections.append(Section("Without GNSS", "", [Table(columns, rows, left)]))
