@@ -8,57 +8,20 @@ ends at their time, as in `railnav.run.ImuStream`.
 
 from __future__ import annotations
 
-from railnav.inertial.alignment import (
-    Alignment,
-    FineAlignment,
-    Rest,
-    VelocityHeading,
-    coarse_align,
-    compass_heading,
-    fine_align,
-    gyrocompass,
-    gyrocompass_error,
-    heading_from_antennas,
-    heading_from_velocity,
-    level,
-    lever_arm_motion,
-    rest,
-)
+from railnav.inertial.advice import advise_positions
+from railnav.inertial.alignment import Alignment, coarse_align, level, lever_arm_motion
 from railnav.inertial.allan import AllanCurve, NoiseParameters, allan_deviation, fit_allan
 from railnav.inertial.autonomous import (
     FixedLatitude,
-    MovingPosition,
-    ReferenceLongitude,
     averaging_time,
     coning_rate,
     fixed_latitude,
     fixed_latitude_error,
     geodetic_minus_geocentric,
-    great_circle_heading,
-    great_circle_heading_error,
-    ground_speed,
-    ground_speed_error,
-    longitude_from_reference,
-    moving_position,
     required_grade,
 )
-from railnav.inertial.calibration import (
-    Position,
-    Solvability,
-    TemperaturePolynomial,
-    TriadCalibration,
-    advise_positions,
-    advise_turns,
-    finite_rotation,
-    fit_temperature,
-    multi_position,
-    position_mean,
-    six_position,
-    solvability,
-    turned_force,
-    turned_rate,
-    vector_calibration,
-)
+from railnav.inertial.calibration import TriadCalibration, multi_position, six_position, vector_calibration
+from railnav.inertial.compass import compass_heading, gyrocompass, gyrocompass_error
 from railnav.inertial.diagnosis import (
     CAUSES,
     Diagnosis,
@@ -76,6 +39,14 @@ from railnav.inertial.error_model import (
     process_noise_sqrt,
     vehicle_design,
 )
+from railnav.inertial.fine_alignment import FineAlignment, fine_align
+from railnav.inertial.great_circle import (
+    great_circle_heading,
+    great_circle_heading_error,
+    ground_speed,
+    ground_speed_error,
+)
+from railnav.inertial.heading import VelocityHeading, heading_from_antennas, heading_from_velocity
 from railnav.inertial.inspection import Finding, inspect_log
 from railnav.inertial.loose import ImuNoise, InitialSigma, LooseSolution, integrate_gnss
 from railnav.inertial.mechanization import (
@@ -85,7 +56,13 @@ from railnav.inertial.mechanization import (
     Trajectory,
     mechanize,
 )
+from railnav.inertial.moving_base import MovingPosition, moving_position
+from railnav.inertial.positions import Position, position_mean
+from railnav.inertial.reference_azimuth import ReferenceLongitude, longitude_from_reference
+from railnav.inertial.resting import Rest, rest
 from railnav.inertial.sensors import GRADES, SensorGrade, TriadModel, TriadSamples, misalignment_matrix, simulate_triad
+from railnav.inertial.temperature import TemperaturePolynomial, fit_temperature
+from railnav.inertial.turns import Solvability, advise_turns, finite_rotation, solvability, turned_force, turned_rate
 
 __all__ = [
     "CAUSES",

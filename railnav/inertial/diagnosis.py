@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from railnav.errors import EstimationError
-from railnav.inertial.calibration import advise_positions
+from railnav.inertial.advice import advise_positions, axes_up
 
 FloatArray = NDArray[np.float64]
 
@@ -206,10 +206,7 @@ def diagnose(
     rank = int(np.sum(singular > 1e-6 * singular[0]))
     if rank < 9:
         add = advise_positions(u, 9 - rank)
-        names = "; ".join(
-            " ".join(f"{'+' if c > 0 else '-'}{axis}" for c, axis in zip(d, "xyz", strict=True) if abs(c) > 1e-9)
-            for d in add
-        )
+        names = "; ".join(axes_up(d) for d in add)
         raise EstimationError(
             f"{len(V)} positions tell only {rank} of 9 causes apart; add positions with these axes up: {names}"
         )

@@ -10,20 +10,12 @@ from scipy.stats import chi2
 
 from railnav.attitude import dcm_from_euler, dcm_from_rotation_vector, rotation_vector_from_dcm
 from railnav.errors import EstimationError
-from railnav.inertial.alignment import (
-    Rest,
-    coarse_align,
-    compass_heading,
-    fine_align,
-    gyrocompass,
-    gyrocompass_error,
-    heading_from_antennas,
-    heading_from_velocity,
-    level,
-    lever_arm_motion,
-    rest,
-)
+from railnav.inertial.alignment import coarse_align, level, lever_arm_motion
+from railnav.inertial.compass import compass_heading, gyrocompass, gyrocompass_error
+from railnav.inertial.fine_alignment import fine_align
+from railnav.inertial.heading import heading_from_antennas, heading_from_velocity
 from railnav.inertial.mechanization import EARTH_RATE, GravityField
+from railnav.inertial.resting import Rest, rest
 from railnav.inertial.sensors import TriadModel, simulate_triad
 from railnav.units import wrap_angle
 

@@ -17,15 +17,17 @@ from railnav.inertial.autonomous import (
     fixed_latitude,
     fixed_latitude_error,
     geodetic_minus_geocentric,
+    required_grade,
+)
+from railnav.inertial.great_circle import (
     great_circle_heading,
     great_circle_heading_error,
     ground_speed,
     ground_speed_error,
-    longitude_from_reference,
-    moving_position,
-    required_grade,
 )
 from railnav.inertial.mechanization import EARTH_RATE
+from railnav.inertial.moving_base import moving_position
+from railnav.inertial.reference_azimuth import longitude_from_reference
 
 DEGREE = math.pi / 180
 HOUR = DEGREE / 3600

@@ -8,19 +8,11 @@ from scipy.stats import chi2
 
 from railnav.attitude import dcm_from_rotation_vector
 from railnav.errors import EstimationError
-from railnav.inertial.calibration import (
-    advise_positions,
-    advise_turns,
-    finite_rotation,
-    fit_temperature,
-    multi_position,
-    position_mean,
-    six_position,
-    solvability,
-    turned_force,
-    turned_rate,
-    vector_calibration,
-)
+from railnav.inertial.advice import advise_positions
+from railnav.inertial.calibration import multi_position, six_position, vector_calibration
+from railnav.inertial.positions import position_mean
+from railnav.inertial.temperature import fit_temperature
+from railnav.inertial.turns import advise_turns, finite_rotation, solvability, turned_force, turned_rate
 
 DEGREE = np.pi / 180
 UP = (0.0, 0.0, 1.0)
