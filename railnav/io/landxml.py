@@ -33,11 +33,11 @@ from railnav.io.design import (
     Cant,
     Laid,
     Plan,
-    Profile,
     closing,
     integrate,
 )
 from railnav.io.junctions import Design, join_designs
+from railnav.track.elements import Gradients
 from railnav.track.model import TrackModel
 from railnav.units import wrap_angle
 
@@ -338,7 +338,7 @@ class _Alignment:
     plan: Plan
     gap: FloatArray
     kink: FloatArray
-    profile: Profile | None
+    profile: Gradients | None
     breaks: FloatArray
     cant: Cant | None
     directions: str
@@ -650,7 +650,7 @@ def _read_equations(
 
 def _read_profile(
     place: _Place, node: Any, start: float, length: float, notes: list[str]
-) -> tuple[Profile | None, FloatArray]:
+) -> tuple[Gradients | None, FloatArray]:
     """The first ProfAlign as a callable, or None; and where its straights and curves meet."""
     chosen = [align for profile in _children(node, "Profile") for align in _children(profile, "ProfAlign")]
     if not chosen:
@@ -689,7 +689,7 @@ def _read_profile(
 
 def _lay_profile(
     place: _Place, nodes: list[Any], along: FloatArray, height: FloatArray, slope: FloatArray, notes: list[str]
-) -> tuple[Profile, FloatArray]:
+) -> tuple[Gradients, FloatArray]:
     """Straights with curves: pieces, each from `begin`, of height h + g x + c x^2 or a circle of signed radius r."""
     begin, base, grade, bend, radius = [-math.inf], [height[0]], [slope[0]], [0.0], [0.0]
     origin = [along[0]]
@@ -733,21 +733,8 @@ def _lay_profile(
             piece(float(along[i]) - before, h0, g0, c=(middle - g0) / (2.0 * before))
             piece(float(along[i]), h0 + before * (g0 + middle) / 2.0, middle, c=(g1 - middle) / (2.0 * after))
         piece(reach, float(height[i]) + g1 * after, g1)
-    table = np.array([begin, origin, base, grade, bend, radius])
-
-    def profile(at: FloatArray, derivative: int) -> FloatArray:
-        which = np.searchsorted(table[0], at, side="right") - 1
-        _, zero, h, g, c, r = table[:, which]
-        x = at - zero
-        # a circle from the point with gradient g: sine of the angle grows by x / r
-        sine = np.where(r == 0.0, 0.0, g / np.hypot(1.0, g) + x / np.where(r == 0.0, 1.0, r))
-        cosine = np.sqrt(np.maximum(1.0 - sine**2, 1e-12))
-        if derivative:
-            return np.asarray(np.where(r == 0.0, g + 2.0 * c * x, sine / cosine))
-        round_ = r * (1.0 / np.hypot(1.0, g) - cosine)
-        return np.asarray(h + np.where(r == 0.0, g * x + c * x * x, round_))
-
-    return profile, table[0, 1:]
+    table = Gradients(*(np.array(column) for column in (begin, origin, base, grade, bend, radius)))
+    return table, table.begin[1:]
 
 
 def _read_cant(place: _Place, node: Any, start: float, plan: Plan, notes: list[str]) -> Cant | None:
