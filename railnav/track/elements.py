@@ -221,7 +221,9 @@ def _cubic(k0: FloatArray, k1: FloatArray, length: FloatArray, t: FloatArray) ->
 
     one = np.ones_like(wanted)
     if (wanted > 2.0 * _STEEPEST * (1.0 + _STEEPEST**2) ** -1.5 * run(_STEEPEST * one, one)).any():
-        raise TrackError("a cubic parabola too long for its radius: its curvature does not grow that far; use a clothoid")
+        raise TrackError(
+            "a cubic parabola too long for its radius: its curvature does not grow that far; use a clothoid"
+        )
     low, high = 0.0 * one, _STEEPEST * one
     p = 0.5 * wanted
     for _ in range(60):  # k L = 2 p (1 + p^2)^(-3/2) G(p), growing in p: secant within the bracket
@@ -283,5 +285,3 @@ def closing(
     gap = np.vstack([stated, ends[-1] if end is None else end]) - ends[1:]
     turned = np.append(plan.grid_bearing[1:], bearing[-1] if end_bearing is None else end_bearing) - bearing[1:]
     return gap, wrap_angle(turned)
-
-
