@@ -45,7 +45,7 @@ class Design:
     gap : (n, 2) array
         What they miss each other by, m.
     posts : callable
-        From the track laid out to (p, 2) offsets and chainages, ends included, m.
+        From the track laid out to (p, 2) offsets and chainages, ends included, m; none where it has no chainage.
     profile, cant, breaks
         As for `railnav.io.design.lay`.
     line, name : str
@@ -123,15 +123,16 @@ def join_designs(
         for k, table in enumerate(here.tables):
             begin, end = borders[k], borders[k + 1]
             inner = posts[(posts[:, 0] > begin) & (posts[:, 0] < end)] - [begin, 0.0]
-            first, last = np.interp([begin, end], posts[:, 0], posts[:, 1])
+            known = len(posts) > 0
+            first, last = np.interp([begin, end], posts[:, 0], posts[:, 1]) if known else (0.0, 0.0)
             sections.append(
                 TrackSection(
                     f"{design.track}.{k + 1}" if mine else design.track,
                     table,
                     design.line,
                     design.name,
-                    float(first),
-                    float(last),
+                    float(first) if known else None,
+                    float(last) if known else None,
                     inner if len(inner) else None,
                 )
             )

@@ -93,15 +93,16 @@ _SENSES = (
 _SAID_DIRECTION = math.radians(0.1)
 
 
-def read_landxml(path: str | Path, *, crs: Any, spacing: float = 1.0) -> TrackModel:
+def read_landxml(path: str | Path, *, crs: Any = None, spacing: float = 1.0) -> TrackModel:
     """Read the alignments of a LandXML file as tracks, joined where one ends on another.
 
     Parameters
     ----------
     path : path
         LandXML 1.x in metres, points "northing easting [height]".
-    crs : str or pyproj.CRS
-        The plane of the coordinates, which files rarely state: "EPSG:2056", WKT, a PROJ string, "gk3", "gk6".
+    crs : str or pyproj.CRS, optional
+        The plane of the coordinates: "EPSG:2056", WKT, a PROJ string, "gk3", "gk6". By default the one that the file's
+        CoordinateSystem names, which few files do.
     spacing : float
         Wanted distance between the model's knots, m.
 
@@ -142,6 +143,7 @@ def read_landxml(path: str | Path, *, crs: Any, spacing: float = 1.0) -> TrackMo
     if not spacing > 0.0:
         raise InputError(f"knot spacing {spacing} m is not positive", file=path, remedy="use 1 m")
     root = _document(path)
+    crs = _stated_plane(root, path) if crs is None else crs
     unit = _direction_unit(root, path)
     found = [node for node in root.iter() if _local(node) == "Alignment"]
     if not found:
@@ -178,7 +180,8 @@ def read_landxml(path: str | Path, *, crs: Any, spacing: float = 1.0) -> TrackMo
         "notes": notes[:_MOST_NOTES] + ([f"and {len(notes) - _MOST_NOTES} more"] if len(notes) > _MOST_NOTES else []),
     }
     designs = [
-        Design(a.name, a.plan, a.gap, a.posts, a.profile, a.cant, a.breaks, name=a.description) for a in alignments
+        Design(a.name, a.plan, a.gap, a.posts, a.profile, a.cant, a.breaks, line=a.line, name=a.description)
+        for a in alignments
     ]
     return join_designs(path, frame, designs, spacing=spacing, provenance=provenance)
 
@@ -237,6 +240,28 @@ def _document(path: Path) -> Any:
     if not version.startswith("1."):
         raise InputError(f"is LandXML {version[:20]!r}", file=path, remedy="export LandXML 1.2")
     return root
+
+
+def _stated_plane(root: Any, path: Path) -> str:
+    """The plane that the file names: its EPSG code, or its well-known text."""
+    for system in _children(root, "CoordinateSystem"):
+        code = str(system.get("epsgCode", "")).strip().removeprefix("EPSG:")
+        if code.isdigit() and len(code) < 7:
+            return f"EPSG:{code}"
+        text = str(system.get("ogcWktCode", "")).strip()
+        if text[:5].upper() in ("PROJC", "BOUND", "COMPO", "DERIV"):
+            return text[:20_000]
+    raise InputError("grid coordinates need the plane they lie in", file=path, remedy="name it, e.g. --crs EPSG:31467")
+
+
+def _features(node: Any) -> dict[str, str]:
+    """What railnav's own writer noted where LandXML has no place."""
+    return {
+        str(item.get("label", "")): " ".join(str(item.get("value", "")).split())
+        for feature in _children(node, "Feature")
+        if feature.get("code") == "railnav"
+        for item in _children(feature, "Property")
+    }
 
 
 def _local(node: Any) -> str:
@@ -342,10 +367,14 @@ class _Alignment:
     breaks: FloatArray
     cant: Cant | None
     directions: str
+    line: str
+    counted: bool
 
     def posts(self, laid: Laid) -> FloatArray:
         """Offsets and chainages at the ends and on both sides of station equations, (p, 2) m."""
         length = float(self.plan.edges[-1])
+        if not self.counted:
+            return np.empty((0, 2))
         rows, at, station, sense = [(0.0, self.start)], 0.0, self.start, 1.0
         for where, back, ahead, onward in (*self.equations, (length, 0.0, 0.0, 1.0)):
             between = np.arange(at + _POST_EVERY, where - 1.0, _POST_EVERY)
@@ -370,6 +399,7 @@ def _read_alignment(path: Path, node: Any, unit: str, notes: list[str]) -> _Alig
         notes.append(f"{name}: the plan is {length:.3f} m long, the alignment says {stated:.3f} m; the plan counts")
     start = place.number(node, "staStart", default=0.0)
     profile, breaks = _read_profile(place, node, start, length, notes)
+    noted = _features(node)
     return _Alignment(
         name,
         " ".join(str(node.get("desc", "")).split()),
@@ -382,6 +412,8 @@ def _read_alignment(path: Path, node: Any, unit: str, notes: list[str]) -> _Alig
         breaks,
         _read_cant(place, node, start, plan, notes),
         _judge_directions(place, nodes, plan, unit, notes),
+        noted.get("line", ""),
+        noted.get("chainage") != "none",
     )
 
 
