@@ -27,10 +27,16 @@ if TYPE_CHECKING:
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Same seed, same run.")
 @click.option(
     "--grade",
-    type=click.Choice(["survey", "service", "phone"]),
+    type=click.Choice(["survey", "service", "phone", "mems", "tactical"]),
     default="service",
     show_default=True,
-    help="Sensors: survey car (2 cm GNSS), train in service (GNSS, IMU, odometer), or a telephone.",
+    help="Sensors: survey car (2 cm GNSS), train in service (GNSS, IMU, odometer), telephone, or a train with an IMU of a data "
+    "sheet, low-cost or tactical.",
+)
+@click.option(
+    "--imu",
+    type=click.Choice(["L3G4200D", "IMU440", "RT3003", "STIM300"]),
+    help="Another IMU, by its data sheet (L3G4200D: with the LSM303DLH).",
 )
 @click.option("--top-speed", type=click.FloatRange(1, 400), default=120.0, show_default=True, help="Top speed, km/h.")
 @click.option(
@@ -39,6 +45,20 @@ if TYPE_CHECKING:
     multiple=True,
     help="Seconds without GNSS, e.g. 120-180; may be given more than once.",
 )
+@click.option(
+    "--fault",
+    metavar="NAME@SECONDS",
+    multiple=True,
+    help="What goes wrong, and when, e.g. gnss-ramp-left-0.5@120; may be given more than once.",
+)
+@click.option(
+    "--list-faults",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=lambda ctx, _, value: _list_faults(ctx) if value else None,
+    help="List the faults by name, and stop.",
+)
 @json_option
 def command(
     model: Path,
@@ -46,8 +66,10 @@ def command(
     route: str | None,
     seed: int,
     grade: str,
+    imu: str | None,
     top_speed: float,
     outage: tuple[str, ...],
+    fault: tuple[str, ...],
     as_json: bool,
 ) -> None:
     """Simulate a run over a model, with its truth.
@@ -65,9 +87,10 @@ def command(
     from railnav.errors import RailnavError
 
     outages = [_outage(text) for text in outage]
+    faults = [_fault(text) for text in fault]
     _files.check_output_folder(output)
     from railnav.io.run import write_run
-    from railnav.simulation import OUTFITS, Driving, simulate
+    from railnav.simulation import Driving, outfit_of, simulate, with_fault
 
     reference = _files.read_model(model)
     names = _names(route) if route is not None else ()
@@ -79,20 +102,34 @@ def command(
             reference,
             tracks,
             seed=seed,
-            outfit=OUTFITS[grade],
+            outfit=outfit_of(grade, imu=imu),
             driving=Driving(speed=top_speed / 3.6),
             outages=outages,
             run_id=output.resolve().name,
             progress=tell,
         )
+    for name, onset in faults:
+        run = with_fault(run, name, start=onset, seed=seed)
     write_run(run, output, truth=truth)
     facts = describe_run(run)
     if as_json:
-        print_json({**facts, "route": tracks, "seed": seed, "grade": grade, "simulated": True, "output": output})
+        print_json(
+            {
+                **facts,
+                "route": tracks,
+                "seed": seed,
+                "grade": grade,
+                "faults": list(fault),
+                "simulated": True,
+                "output": output,
+            }
+        )
     else:
         print_run(facts, f"{output} written (simulated)")
         click.echo(f"Route: {' > '.join(tracks)}")
         click.echo(f"Truth: {output / 'truth.csv'}")
+        for name, onset in faults:
+            click.echo(f"Fault: {name}, from {onset:g} s")
 
 
 def _outage(text: str) -> tuple[float, float]:
@@ -104,6 +141,25 @@ def _outage(text: str) -> tuple[float, float]:
     if not 0 <= times[0] < times[1] < float("inf"):
         raise click.BadParameter(f"{text!r} does not grow", param_hint="--outage")
     return times
+
+
+def _fault(text: str) -> tuple[str, float]:
+    name, _, onset = text.partition("@")
+    try:
+        return name.strip(), float(onset or 0.0)
+    except ValueError:
+        raise click.BadParameter(
+            f"{text!r} is not NAME@SECONDS, e.g. gnss-silent-60s@120", param_hint="--fault"
+        ) from None
+
+
+def _list_faults(ctx: click.Context) -> None:
+    from railnav.simulation import FAULTS
+
+    wide = max(len(name) for name in FAULTS)
+    for fault in FAULTS.values():
+        click.echo(f"{fault.name:<{wide}}  {fault.words}")
+    ctx.exit()
 
 
 def _names(route: str) -> tuple[str, ...]:

@@ -2,8 +2,10 @@
 
 from railnav.simulation.bundled import demo_line
 from railnav.simulation.driving import Driving, Motion, drive
+from railnav.simulation.faults import FAULTS, Fault, with_fault, with_shifted_model, with_stale_track
 from railnav.simulation.journey import Leg, Path, Stop, path_of
 from railnav.simulation.sensors import (
+    IMU_SHEETS,
     OUTFITS,
     PHONE,
     SERVICE,
@@ -14,16 +16,20 @@ from railnav.simulation.sensors import (
     ImuSensor,
     OdometerSensor,
     Outfit,
+    outfit_of,
 )
 from railnav.simulation.train import poses, simulate
 
 __all__ = [
+    "FAULTS",
+    "IMU_SHEETS",
     "OUTFITS",
     "PHONE",
     "SERVICE",
     "SURVEY",
     "AnglesSensor",
     "Driving",
+    "Fault",
     "GaugeSensor",
     "GnssSensor",
     "ImuSensor",
@@ -35,7 +41,11 @@ __all__ = [
     "Stop",
     "demo_line",
     "drive",
+    "outfit_of",
     "path_of",
     "poses",
     "simulate",
+    "with_fault",
+    "with_shifted_model",
+    "with_stale_track",
 ]

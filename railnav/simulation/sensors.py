@@ -8,14 +8,28 @@ nothing in the others.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from railnav.errors import InputError
+
+if TYPE_CHECKING:
+    from railnav.inertial.sensors import SensorGrade
+
 FloatArray = NDArray[np.float64]
 
 _DEGREE = math.pi / 180.0
+
+#: Inertial units by data sheet: the names of gyroscope and accelerometer in `railnav.inertial.sensors.GRADES`.
+IMU_SHEETS = {
+    "L3G4200D": ("L3G4200D gyroscope", "LSM303DLH accelerometer"),
+    "IMU440": ("IMU440 gyroscope", "IMU440 accelerometer"),
+    "RT3003": ("RT3003 gyroscope", "RT3003 accelerometer"),
+    "STIM300": ("STIM300 gyroscope", "STIM300 accelerometer"),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +113,8 @@ class ImuSensor:
         Random walk of the biases, rad/s/sqrt(s) and m/s^2/sqrt(s).
     gyro_scale, accelerometer_scale : float
         Sigma of each axis's scale error.
+    gyro_full_scale, accelerometer_full_scale : float
+        Greatest reading, rad/s and m/s^2: beyond it an axis is saturated.
     """
 
     interval: float = 0.01
@@ -113,6 +129,47 @@ class ImuSensor:
     accelerometer_bias_walk: float = 2e-5
     gyro_scale: float = 1e-3
     accelerometer_scale: float = 1e-3
+    gyro_full_scale: float = math.inf
+    accelerometer_full_scale: float = math.inf
+
+    @classmethod
+    def of_sheet(cls, name: str, *, interval: float = 0.01) -> ImuSensor:
+        """An IMU by its data sheet, one of `IMU_SHEETS`: white noise, switch-on bias, in-run instability, scale, range.
+
+        The in-run part becomes a random walk of the bias that grows as fast: density = instability * sqrt(2 / correlation time).
+
+        Raises
+        ------
+        InputError
+            An unknown sheet.
+
+        Examples
+        --------
+        >>> ImuSensor.of_sheet("STIM300").gyro_white < ImuSensor.of_sheet("IMU440").gyro_white
+        True
+        """
+        from railnav.inertial.sensors import GRADES
+
+        if name not in IMU_SHEETS:
+            raise InputError(f"no data sheet {name!r}; there are {', '.join(IMU_SHEETS)}")
+        gyro, accelerometer = (GRADES[sheet] for sheet in IMU_SHEETS[name])
+
+        def walk(grade: SensorGrade) -> float:
+            return grade.instability * math.sqrt(2.0 / grade.correlation_time)
+
+        return cls(
+            interval=interval,
+            gyro_white=gyro.random_walk,
+            accelerometer_white=accelerometer.random_walk,
+            gyro_bias=math.hypot(gyro.bias, gyro.instability),
+            accelerometer_bias=math.hypot(accelerometer.bias, accelerometer.instability),
+            gyro_bias_walk=walk(gyro),
+            accelerometer_bias_walk=walk(accelerometer),
+            gyro_scale=gyro.scale,
+            accelerometer_scale=accelerometer.scale,
+            gyro_full_scale=gyro.full_scale,
+            accelerometer_full_scale=accelerometer.full_scale,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,8 +305,46 @@ PHONE = Outfit(
     ),
 )
 
+_SHEET_GNSS, _SHEET_ODOMETER = GnssSensor(outlier_probability=0.002), OdometerSensor(slip_rate=4.0)
+
+
+def outfit_of(name: str, *, imu: str | None = None) -> Outfit:
+    """An outfit by name: `OUTFITS`, or "mems" and "tactical": a service train whose IMU is that of a data sheet.
+
+    Parameters
+    ----------
+    name : str
+        "survey", "service", "phone", "mems" (IMU440) or "tactical" (STIM300).
+    imu : str, optional
+        One of `IMU_SHEETS`, instead of the outfit's own IMU.
+
+    Returns
+    -------
+    Outfit
+
+    Raises
+    ------
+    InputError
+        Unknown names.
+
+    Examples
+    --------
+    >>> outfit_of("tactical").imu.gyro_white < outfit_of("service").imu.gyro_white
+    True
+    """
+    if name in SHEET_OUTFITS:
+        outfit = Outfit(name, gnss=_SHEET_GNSS, imu=ImuSensor.of_sheet(SHEET_OUTFITS[name]), odometer=_SHEET_ODOMETER)
+    elif name in OUTFITS:
+        outfit = OUTFITS[name]
+    else:
+        raise InputError(f"no outfit {name!r}; there are {', '.join((*OUTFITS, *SHEET_OUTFITS))}")
+    return outfit if imu is None else replace(outfit, imu=ImuSensor.of_sheet(imu))
+
+
 #: Outfits by name.
 OUTFITS = {outfit.name: outfit for outfit in (SURVEY, SERVICE, PHONE)}
+#: Outfits of a service train with the IMU of a data sheet.
+SHEET_OUTFITS = {"mems": "IMU440", "tactical": "STIM300"}
 
 
 def gauss_markov(

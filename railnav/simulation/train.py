@@ -350,22 +350,25 @@ def _imu(path: Path, motion: Motion, time: FloatArray, sensor: ImuSensor, genera
     turn = attitude_matrix(*true_mounting[:, None])[0]  # v_imu = (Rz Ry Rx)^T v_body
     count, dt = len(rate), sensor.interval
 
-    def spoil(value: FloatArray, white: float, bias: float, walk: float, scale: float) -> FloatArray:
+    def spoil(value: FloatArray, white: float, bias: float, walk: float, scale: float, most: float) -> FloatArray:
         constant = generator.standard_normal(3) * bias
         factor = 1.0 + generator.standard_normal(3) * scale
         wander = np.cumsum(generator.standard_normal((count, 3)), axis=0) * (walk * np.sqrt(dt))
         noise = generator.standard_normal((count, 3)) * (white / np.sqrt(dt))
-        return np.asarray((value @ turn) * factor + constant + wander + noise)
+        return np.asarray(np.clip((value @ turn) * factor + constant + wander + noise, -most, most))
 
     return ImuStream(
         time=time[1:],
-        gyro=spoil(rate, sensor.gyro_white, sensor.gyro_bias, sensor.gyro_bias_walk, sensor.gyro_scale),
+        gyro=spoil(
+            rate, sensor.gyro_white, sensor.gyro_bias, sensor.gyro_bias_walk, sensor.gyro_scale, sensor.gyro_full_scale
+        ),
         specific_force=spoil(
             force,
             sensor.accelerometer_white,
             sensor.accelerometer_bias,
             sensor.accelerometer_bias_walk,
             sensor.accelerometer_scale,
+            sensor.accelerometer_full_scale,
         ),
         lever_arm_b=arm,
         mounting=np.array(sensor.mounting),

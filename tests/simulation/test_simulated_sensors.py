@@ -283,3 +283,47 @@ def test_progress_is_told(line):
     simulate(line, Leg(("77R-01",), start=50.0, finish=100.0), seed=1, progress=lambda *step: told.append(step))
     assert told[0] == ("simulating sensors", 0, 3)
     assert told[-1] == ("simulating sensors", 3, 3)
+
+
+def test_data_sheets_make_outfits_and_ranges_saturate():
+    from dataclasses import replace
+
+    from railnav.errors import InputError
+    from railnav.simulation import IMU_SHEETS, ImuSensor, Leg, demo_line, outfit_of, simulate
+    from railnav.simulation.sensors import Outfit
+
+    assert {outfit_of(n).imu.gyro_white for n in ("mems", "tactical")} == {
+        ImuSensor.of_sheet(n).gyro_white for n in ("IMU440", "STIM300")
+    }
+    for sheet in IMU_SHEETS:
+        assert outfit_of("service", imu=sheet).imu == ImuSensor.of_sheet(sheet)
+    with pytest.raises(InputError, match="no outfit 'gold'"):
+        outfit_of("gold")
+    with pytest.raises(InputError, match="no data sheet"):
+        ImuSensor.of_sheet("gold")
+    narrow = replace(ImuSensor(), gyro_full_scale=0.01, accelerometer_full_scale=9.0)
+    run, _ = simulate(
+        demo_line(spacing=5.0), Leg(("77R-03",), start=50.0, finish=900.0), seed=1, outfit=Outfit("n", imu=narrow)
+    )
+    assert np.abs(run.imu.gyro).max() <= 0.01
+    assert np.all(run.imu.specific_force[:, 2] == -9.0)  # at rest it would read -9.81
+
+
+def test_simulate_does_named_faults_from_the_command_line(tmp_path):
+    from click.testing import CliRunner
+
+    import railnav as rn
+    from railnav.cli import main
+
+    rn.demo_line(spacing=5.0).to_file(tmp_path / "line.gpkg")
+    words = ["simulate", "-m", str(tmp_path / "line.gpkg"), "--route", "77R-03", "--grade", "mems"]
+    for name, fault in (("sound", []), ("dark", ["--fault", "gnss-silent-60s@100"])):
+        result = CliRunner().invoke(main, [*words, "-o", str(tmp_path / name), *fault])
+        assert result.exit_code == 0, result.output
+    sound, dark = (rn.Run.read(tmp_path / name) for name in ("sound", "dark"))
+    assert len(sound.gnss) - len(dark.gnss) == 60
+    result = CliRunner().invoke(main, [*words, "-o", str(tmp_path / "x"), "--fault", "gnss-silent-6s@100"])
+    assert result.exit_code == 1
+    assert "gnss-silent-60s" in result.stderr
+    assert not (tmp_path / "x").exists()
+    assert "gnss-ramp-left-0.5" in CliRunner().invoke(main, ["simulate", "--list-faults"]).output
