@@ -87,6 +87,10 @@ class ImuStream:
         Reference point to IMU: forward, right, down, m.
     mounting : (3,) array
         Roll, pitch, yaw that turn body axes into IMU axes, rad: v_imu = (Rz Ry Rx)^T v_b.
+    temperature : (m,) array or None
+        Of the sensors, K.
+    calibration : str
+        Name of the calibration that was applied to the samples; empty if they stand as measured.
     """
 
     time: FloatArray
@@ -94,6 +98,8 @@ class ImuStream:
     specific_force: FloatArray
     lever_arm_b: FloatArray = field(default_factory=_zeros3)
     mounting: FloatArray = field(default_factory=_zeros3)
+    temperature: FloatArray | None = None
+    calibration: str = ""
 
     def __len__(self) -> int:
         return len(self.time)

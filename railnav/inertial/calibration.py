@@ -307,6 +307,7 @@ def vector_calibration(readings: ArrayLike, reference: ArrayLike, *, sigma: floa
 
     Examples
     --------
+    >>> from railnav.inertial import turned_force
     >>> force = turned_force(*(np.radians(30.0) * np.arange(12)[:, None] * [2, 4, 1]).T)
     >>> vector_calibration(force * 1.01 + 0.02, force).bias.round(9)
     array([0.02, 0.02, 0.02])

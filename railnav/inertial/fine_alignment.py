@@ -140,7 +140,8 @@ def fine_align(
 
     Examples
     --------
-    >>> from railnav.inertial.mechanization import GravityField
+    >>> from railnav.attitude import dcm_from_euler
+    >>> from railnav.inertial import GravityField
     >>> n, earth = 6000, EARTH_RATE * np.array([np.cos(0.9), 0.0, -np.sin(0.9)])
     >>> force = -GravityField().vector(0.9)
     >>> kind = {"gyro_bias_sigma": 1e-8, "accelerometer_bias_sigma": 1e-4, "angle_random_walk": 1e-7, "velocity_random_walk": 1e-5}

@@ -37,6 +37,8 @@ FORMATS = ("csv", "parquet")
 MAX_CONTENTS_BYTES = 1_000_000
 #: An unsigned odometer may fall by its noise, m, not by more.
 ODOMETER_NOISE = 0.1
+#: Zero of the Celsius scale, K.
+CELSIUS = 273.15
 
 _Vector = tuple[float, float, float]
 
@@ -56,6 +58,7 @@ class _Gnss(_Stream):
 class _Imu(_Stream):
     lever_arm_m: _Vector = (0.0, 0.0, 0.0)
     mounting_deg: _Vector = (0.0, 0.0, 0.0)
+    calibration: str = ""
 
 
 class _Odometer(_Stream):
@@ -99,6 +102,7 @@ _COLUMNS: dict[str, tuple[Column, ...]] = {
         _TIME,
         *(Column(f"gyro_{axis}_rad_s") for axis in "xyz"),
         *(Column(f"accel_{axis}_m_s2") for axis in "xyz"),
+        Column("temperature_c", required=False, complete=False, low=-100, high=200),
     ),
     "odometer": (_TIME, *_optional("distance_m", "speed_m_s"), *_optional("sigma_speed_m_s", positive=True)),
     "gyro_angles": (_TIME, Column("roll_deg"), Column("pitch_deg"), Column("heading_deg")),
@@ -175,7 +179,7 @@ def read_run(folder: str | Path, *, report: Callable[[LogSummary], None] | None 
         start=start,
         direction=contents.run.direction,
         gnss=_gnss(tables["gnss"], time["gnss"], contents.gnss, folder / CONTENTS) if contents.gnss else None,
-        imu=_imu(tables["imu"], time["imu"], contents.imu) if contents.imu else None,
+        imu=_imu(tables["imu"], time["imu"], contents.imu, folder) if contents.imu else None,
         odometer=_odometer(tables["odometer"], time["odometer"], contents.odometer) if contents.odometer else None,
         gyro_angles=_gyro_angles(tables["gyro_angles"], time["gyro_angles"]) if contents.gyro_angles else None,
         gauge=_gauge(tables["gauge"], time["gauge"]) if contents.gauge else None,
@@ -300,13 +304,18 @@ def _stream_file(folder: Path, name: str, stream: _Stream) -> Path:
         cause = f"{stream.format[:40]!r} is no format that is read here; {', '.join(formats)} are"
         remedy = "convert the stream to CSV with the columns of formats.md"
         raise RunError(cause, file=contents, column=f"{name}.format", remedy=remedy)
-    path = Path(stream.file)
+    return _inside(folder, stream.file, column)
+
+
+def _inside(folder: Path, name: str, column: str) -> Path:
+    """Path of a file that run.toml names, which must lie in the run's folder."""
+    contents, path = folder / CONTENTS, Path(name)
     try:
         inside = (folder / path).resolve().is_relative_to(folder.resolve())
     except (OSError, ValueError, RuntimeError) as error:
-        raise RunError(f"{stream.file[:80]!r} is no usable path", file=contents, column=column) from error
+        raise RunError(f"{name[:80]!r} is no usable path", file=contents, column=column) from error
     if path.is_absolute() or not inside:
-        cause = f"{stream.file[:80]!r} lies outside the run folder"
+        cause = f"{name[:80]!r} lies outside the run folder"
         raise RunError(cause, file=contents, column=column, remedy="put the file into the folder")
     return folder / path
 
@@ -403,14 +412,21 @@ def _gnss(table: Table, time: FloatArray, stream: _Gnss, toml: Path) -> GnssStre
     )
 
 
-def _imu(table: Table, time: FloatArray, stream: _Imu) -> ImuStream:
-    return ImuStream(
+def _imu(table: Table, time: FloatArray, stream: _Imu, folder: Path) -> ImuStream:
+    temperature = _known(table, "temperature_c")
+    imu = ImuStream(
         time=time,
         gyro=freeze(np.column_stack([table.number[f"gyro_{axis}_rad_s"] for axis in "xyz"])),
         specific_force=freeze(np.column_stack([table.number[f"accel_{axis}_m_s2"] for axis in "xyz"])),
         lever_arm_b=_fixed(stream.lever_arm_m),
         mounting=_fixed(np.deg2rad(stream.mounting_deg).tolist()),
+        temperature=None if temperature is None else freeze(temperature + CELSIUS),
     )
+    if not stream.calibration:
+        return imu
+    from railnav.io.imu_calibration import calibrated_stream
+
+    return calibrated_stream(imu, _inside(folder, stream.calibration, "imu.calibration"))
 
 
 def _odometer(table: Table, time: FloatArray, stream: _Odometer) -> OdometerStream:
@@ -468,6 +484,7 @@ _DECIMALS: Mapping[str, int] = {
     "hdop": 3,
     **{f"gyro_{axis}_rad_s": 10 for axis in "xyz"},
     **{f"accel_{axis}_m_s2": 8 for axis in "xyz"},
+    "temperature_c": 4,
     "distance_m": 5,
     "roll_deg": 8,
     "pitch_deg": 8,
@@ -503,6 +520,7 @@ def _stream_columns(run: Run, name: str) -> dict[str, FloatArray | Words]:
         case ImuStream():
             columns |= {f"gyro_{axis}_rad_s": stream.gyro[:, i] for i, axis in enumerate("xyz")}
             columns |= {f"accel_{axis}_m_s2": stream.specific_force[:, i] for i, axis in enumerate("xyz")}
+            columns["temperature_c"] = None if stream.temperature is None else stream.temperature - CELSIUS
         case OdometerStream():
             columns |= {
                 "distance_m": stream.distance,
