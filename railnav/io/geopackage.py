@@ -7,6 +7,7 @@ described column by column in `track_models/README.md`. The knots carry the trut
 
 from __future__ import annotations
 
+import json
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +20,7 @@ from railnav.errors import InputError, ModelError, RailnavError
 from railnav.geodesy.grid import GridFrame
 from railnav.io.container import Container, Reader, bounds_of, create, decode_point, line_blob, opened, point_blobs
 from railnav.track.model import KNOT_COLUMNS, End, MilePosts, NodeKind, Nodes, TrackModel
+from railnav.track.records import ROW_SIZE, AxisRecords, Borders, ModelRecords, RecordSource, TrackRecords
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -31,6 +33,14 @@ SCHEMA_VERSION = 1
 DRAWING_TOLERANCE = 0.005
 #: The knot table's BLOB columns in the order of their checksum.
 BLOB_COLUMNS = (*KNOT_COLUMNS, "covariance_g")
+
+#: The table of chain records, a row a track, and its BLOB columns in the order of their checksum.
+RECORDS = "records"
+RECORD_COLUMNS = (
+    "easting", "northing", "height", "across", "across_lean", "across_noise", "up", "up_lean", "up_noise",
+)  # fmt: skip
+#: Beside it: what is known of the frame offsets, one row for the plane and one for height.
+BORDERS = "record_borders"
 
 _KNOT_BYTES = {name: 48 if name == "covariance_g" else 8 for name in BLOB_COLUMNS}
 _ENDS = {end.name.lower(): int(end) for end in End}
@@ -71,6 +81,7 @@ def write_model(model: TrackModel, path: str | Path) -> None:
     """
     _check_unique(model.track_id, "track", path)
     _check_unique(model.nodes.id, "node", path)
+    records = model.records  # before the file that they may lie in is replaced
     try:
         with create(path, model.frame.crs_wkt) as container:
             _write_meta(container, model)
@@ -79,6 +90,8 @@ def write_model(model: TrackModel, path: str | Path) -> None:
             _write_mileposts(container, model)
             _write_movements(container, model)
             _write_knots(container, model)
+            if records is not None:
+                _write_records(container, model, records)
     except (TypeError, ValueError) as error:
         raise ModelError(f"the provenance holds more than JSON values ({error})", file=path) from error
 
@@ -138,6 +151,7 @@ def read_model(path: str | Path) -> TrackModel:
                 movements=_read_movements(reader, tracks["track_id"]),
                 mileposts=_read_mileposts(reader, tracks["track_id"]),
                 provenance=provenance,
+                record_source=_record_source(reader, path),
             )
         except InputError:
             raise
@@ -308,6 +322,53 @@ def _checksum(blobs: list[bytes]) -> int:
     return checksum
 
 
+def _write_records(container: Container, model: TrackModel, records: ModelRecords) -> None:
+    def rows() -> Iterator[tuple[Any, ...]]:
+        names = [track for track in model.track_id if track in records.tracks]
+        for fid, track in enumerate(names, 1):
+            t = records.tracks[track]
+            up = t.up if t.up is not None and t.height is not None else None
+            arrays = [
+                t.easting, t.northing, t.height if up else None, t.across.rows, t.across.lean, t.across.noise,
+                *((up.rows, up.lean, up.noise) if up else (None,) * 3),
+            ]  # fmt: skip
+            blobs = [b"" if a is None else np.ascontiguousarray(a, "<f8").tobytes() for a in arrays]
+            yield (fid, track, len(t.easting), float(t.step), _checksum(blobs), *blobs)
+
+    container.add_table(
+        RECORDS,
+        "track TEXT NOT NULL UNIQUE, nodes INTEGER NOT NULL, step_m DOUBLE NOT NULL, crc32 INTEGER NOT NULL, "
+        + ", ".join(f"{name} BLOB NOT NULL" for name in RECORD_COLUMNS),
+        rows(),
+        description="Square-root records of the surveys, so that later runs refine the model: little-endian float64",
+    )
+    known = [("across", records.across), *([("up", records.up)] if records.up is not None else [])]
+    container.add_table(
+        BORDERS,
+        "coordinate TEXT NOT NULL UNIQUE, who TEXT NOT NULL, crc32 INTEGER NOT NULL, rows BLOB NOT NULL, value BLOB NOT NULL",
+        [
+            (
+                fid,
+                name,
+                json.dumps({"tracks": b.tracks, "receivers": b.receivers}, ensure_ascii=False),
+                _checksum(blobs := [np.ascontiguousarray(v, "<f8").tobytes() for v in (b.rows, b.value)]),
+                *blobs,
+            )
+            for fid, (name, b) in enumerate(known, 1)
+        ],
+        description="What is known of the frame offsets of tracks and receivers",
+    )
+    container.add_table(
+        "record_facts",
+        "key TEXT NOT NULL UNIQUE, value TEXT NOT NULL",
+        [
+            (1, "receivers", json.dumps(records.receivers, allow_nan=False, ensure_ascii=False)),
+            (2, "runs", json.dumps(records.runs, allow_nan=False, ensure_ascii=False)),
+        ],
+        description="Receivers and runs behind the records: keys and JSON values",
+    )
+
+
 # --- reading ----------------------------------------------------------------------------------------------------------
 
 
@@ -472,3 +533,121 @@ def _read_knots(reader: Reader, track_id: tuple[str, ...]) -> tuple[IntArray, di
         if checksum != crc[row]:
             sizes.refuse(row, "crc32", f"the geometry of track {track_id[i]!r:.40} is damaged (checksum differs)")
     return knot_start, knots
+
+
+# --- records ----------------------------------------------------------------------------------------------------------
+
+
+def _record_source(reader: Reader, path: str | Path) -> RecordSource | None:
+    """Read the records when they are asked for; None where the file has none."""
+    if RECORDS not in reader.tables():
+        return None
+    place = Path(path).resolve()
+    stamp = _stamp(place)
+
+    def source() -> ModelRecords:
+        if _stamp(place) != stamp:
+            raise ModelError("has changed since the model was read from it", file=path, remedy="read the model again")
+        return read_records(place)
+
+    return source
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size
+
+
+def read_records(path: str | Path) -> ModelRecords:
+    """Read the square-root records of the surveys behind a stored model.
+
+    Parameters
+    ----------
+    path : path
+        A GeoPackage that `write_model` wrote.
+
+    Returns
+    -------
+    ModelRecords
+
+    Raises
+    ------
+    ModelError
+        There are none, or they are damaged.
+
+    Examples
+    --------
+    >>> read_records("nowhere.gpkg")
+    Traceback (most recent call last):
+    railnav.errors.ModelError: nowhere.gpkg: does not exist; check the name
+    """
+    with opened(path, CONTENT, newest=SCHEMA_VERSION, error=ModelError) as reader:
+        tables = reader.tables()
+        if not {RECORDS, BORDERS, "record_facts"} <= tables:
+            reader.refuse(
+                "holds no survey records", remedy="build the model from its runs with this version of railnav"
+            )
+        try:
+            facts = {key: json.loads(value) for key, value in reader.select("record_facts", ("key", "value"))}
+            borders = {
+                name: _read_borders(reader, name, json.loads(who), crc, rows, value)
+                for name, who, crc, rows, value in reader.select(
+                    BORDERS, ("coordinate", "who", "crc32", "rows", "value")
+                )
+            }
+            tracks = {
+                track: _read_track_records(reader, fid, track, nodes, step, crc)
+                for track, nodes, step, crc, fid in reader.select(RECORDS, ("track", "nodes", "step_m", "crc32", "fid"))
+            }
+            return ModelRecords(
+                tracks=tracks,
+                across=borders["across"],
+                up=borders.get("up"),
+                receivers=dict(facts["receivers"]),
+                runs=tuple(facts["runs"]),
+            )
+        except InputError:
+            raise
+        except (KeyError, TypeError, ValueError, RecursionError, RailnavError) as error:
+            reader.refuse(f"its survey records are damaged ({error})", layer=RECORDS, remedy="build the model again")
+
+
+def _read_borders(reader: Reader, name: str, who: Any, crc: Any, rows: Any, value: Any) -> Borders:
+    if not (isinstance(rows, bytes) and isinstance(value, bytes)) or _checksum([rows, value]) != crc:
+        reader.refuse(f"the frame offsets {name!r:.20} are damaged (checksum differs)", layer=BORDERS)
+    size = (len(who["tracks"]) + len(who["receivers"])) * (2 if name == "across" else 1)
+    return Borders(
+        tuple(who["tracks"]),
+        tuple(who["receivers"]),
+        np.frombuffer(rows, "<f8").reshape(size, size),
+        np.frombuffer(value, "<f8").reshape(size),
+    )
+
+
+def _read_track_records(reader: Reader, fid: int, track: str, nodes: Any, step: Any, crc: Any) -> TrackRecords:
+    blobs = dict(reader.blobs(RECORDS, RECORD_COLUMNS, fid))
+    sound = all(isinstance(blob, bytes) for blob in blobs.values())
+    if not sound or type(nodes) is not int or nodes < 3 or _checksum(list(blobs.values())) != crc:
+        reader.refuse(f"the records of track {track!r:.40} are damaged (checksum differs)", layer=RECORDS)
+    N = int(nodes)
+    if not isinstance(step, float) or not 0 < step < np.inf:
+        reader.refuse(f"the nodes of track {track!r:.40} lie {step!r:.20} m apart", layer=RECORDS)
+
+    def of(name: str, *shape: int) -> FloatArray:
+        return np.frombuffer(blobs[name], "<f8").reshape(shape)
+
+    def axis(name: str, borders: int) -> AxisRecords:
+        return AxisRecords(of(name, N, ROW_SIZE), of(f"{name}_lean", N, 3, borders), of(f"{name}_noise", N - 1))
+
+    high = bool(blobs["height"])
+    return TrackRecords(
+        step=float(step),
+        easting=of("easting", N),
+        northing=of("northing", N),
+        height=of("height", N) if high else None,
+        across=axis("across", 2),
+        up=axis("up", 1) if high else None,
+    )

@@ -156,66 +156,66 @@ def reflect_columns(A: FloatArray, rows: int, columns: int) -> None:
 
 @njit(cache=True)
 def sweep(
-    step: float, noise: FloatArray, drive: FloatArray, phi: FloatArray, sigma: FloatArray,
-    first: IntArray, who: IntArray, lead: FloatArray, weight: FloatArray, value: FloatArray, design: FloatArray,
-    prior: FloatArray, prior_value: FloatArray, keep: bool,
+    phi: FloatArray, drive: FloatArray, first_sigma: FloatArray, M: FloatArray, L: FloatArray, U: FloatArray,
+    first: IntArray, who: IntArray, place: IntArray, axis: FloatArray, weight: FloatArray, value: FloatArray, design: FloatArray,
+    prior: FloatArray, prior_value: FloatArray, final: FloatArray, final_value: FloatArray, keep: bool,
     Rkk: FloatArray, Rkn: FloatArray, D: FloatArray, T: FloatArray,
 ) -> float:  # fmt: skip
     """Sweep the bordered chain forward (spec 15.2, 15.6); T gathers the rows left for the border, returns sum ln |R_kk|."""
-    # N nodes, K runs, n = K + 3 states: [error of run 0, ..., error of run K-1, y, y', y'']; b columns: value, then B a run
-    # noise (N-1,) sd of d(curvature)/sqrt(m); drive (N-1,) -d(nominal curvature); phi (N-1, K) memory; sigma (K,) m
-    # first (N+1,) CSR of rows; who (rows,) run; lead (rows,) m from node; weight (rows,) 1/m; value (rows,); design (rows, B)
-    # prior (3,) weights and prior_value (3,) of [y, y', y''] at node 0; Rkk, Rkn (N, n, n), D (N, n, b) filled if keep (else N = 1)
+    # N nodes, E errors, n = E + 3 states: [errors of the runs, y, y', y'']; b columns: value, then the border
+    # phi (N-1, E) memory and drive (N-1, E) sd of the errors' steps; first_sigma (E,) sd at node 0
+    # M, L (N-1, q, 3), U (N-1, q, 1 + c): M (y,y',y'')_k + L (y,y',y'')_k+1 + U[:, 1:] (last c borders) = U[:, 0], whitened
+    # first (N+1,) CSR of rows; who (rows,) error state, -1 none; place (rows,) first border column, -1 none; axis (rows, 3),
+    # weight (rows,) on the error, value (rows,), design (rows, B): whitened
+    # prior, prior_value (3,) weights of [y, y', y''] at node 0; final (f, 3), final_value (f, 1 + c): rows at the last node
+    # Rkk, Rkn (N, n, n), D (N, n, b) filled if keep (else N = 1)
     N = phi.shape[0] + 1
     errors = phi.shape[1]
     n = errors + 3
     b = T.shape[1]
     B = design.shape[1]
+    q = M.shape[1]
+    c_many = U.shape[2] - 1
+    tail = b - c_many  # first of the last c border columns
     most = 0
     for k in range(N):
         most = max(most, first[k + 1] - first[k])
-    A = np.zeros((2 * n, 2 * n + b))
+    most += final.shape[0]
+    rows_A = n + errors + q
+    A = np.zeros((rows_A, 2 * n + b))
     C = np.zeros((n + most, n + b))
-    G = np.zeros((b + most, b))
+    spare = max(most, errors + q - n)
+    G = np.zeros((b + max(spare, 0), b))
     logdet = 0.0
-    h = step
-    # W = inverse of the lower Cholesky factor of [[h5/20, h4/8, h3/6], [., h3/3, h2/2], [., ., h]] (curvature random walk)
-    l00 = np.sqrt(h**5 / 20.0)
-    l10 = h**4 / 8.0 / l00
-    l20 = h**3 / 6.0 / l00
-    l11 = np.sqrt(h**3 / 3.0 - l10 * l10)
-    l21 = (h * h / 2.0 - l20 * l10) / l11
-    l22 = np.sqrt(h - l20 * l20 - l21 * l21)
-    W = np.zeros((3, 3))
-    W[0, 0], W[1, 1], W[2, 2] = 1.0 / l00, 1.0 / l11, 1.0 / l22
-    W[1, 0] = -l10 * W[0, 0] / l11
-    W[2, 1] = -l21 * W[1, 1] / l22
-    W[2, 0] = -(l20 * W[0, 0] + l21 * W[1, 0]) / l22
-    F = np.zeros((3, 3))
-    F[0, 0] = F[1, 1] = F[2, 2] = 1.0
-    F[0, 1] = F[1, 2] = h
-    F[0, 2] = 0.5 * h * h
-    WF = W @ F
     for j in range(errors):
-        C[j, j] = 1.0 / sigma[j]
+        C[j, j] = 1.0 / first_sigma[j]
     for j in range(3):
         C[errors + j, errors + j] = prior[j]
         C[errors + j, n] = prior[j] * prior_value[j]
     for k in range(N):
         rows = n
         for i in range(first[k], first[k + 1]):
-            w, g = weight[i], lead[i]
             for c in range(n + b):
                 C[rows, c] = 0.0
-            C[rows, who[i]] = w
-            C[rows, errors] = w
-            C[rows, errors + 1] = w * g
-            C[rows, errors + 2] = 0.5 * w * g * g
-            C[rows, n] = w * value[i]
-            if b > 1:
+            if who[i] >= 0:
+                C[rows, who[i]] = weight[i]
+            for c in range(3):
+                C[rows, errors + c] = axis[i, c]
+            C[rows, n] = value[i]
+            if b > 1 and place[i] >= 0:
                 for j in range(B):
-                    C[rows, n + 1 + who[i] * B + j] = w * design[i, j]
+                    C[rows, n + place[i] + j] = design[i, j]
             rows += 1
+        if k == N - 1:
+            for i in range(final.shape[0]):
+                for c in range(n + b):
+                    C[rows, c] = 0.0
+                for c in range(3):
+                    C[rows, errors + c] = final[i, c]
+                C[rows, n] = final_value[i, 0]
+                for c in range(c_many):
+                    C[rows, n + tail + c] = final_value[i, 1 + c]
+                rows += 1
         reflect_columns(C[:rows], rows, n)
         left = rows - n
         if left > 0:
@@ -236,7 +236,7 @@ def sweep(
                 Rkk[k] = C[:n, :n]
                 D[k] = C[:n, n:]
             break
-        for i in range(2 * n):
+        for i in range(rows_A):
             for c in range(2 * n + b):
                 A[i, c] = 0.0
         for i in range(n):
@@ -245,16 +245,18 @@ def sweep(
             for c in range(b):
                 A[i, 2 * n + c] = C[i, n + c]
         for j in range(errors):
-            f = phi[k, j]
-            w = 1.0 / (sigma[j] * np.sqrt(1.0 - f * f))
-            A[n + j, j] = -w * f
+            w = 1.0 / drive[k, j]
+            A[n + j, j] = -w * phi[k, j]
             A[n + j, n + j] = w
-        for i in range(3):
+        for i in range(q):
             for j in range(3):
-                A[n + errors + i, errors + j] = -WF[i, j] / noise[k]
-                A[n + errors + i, n + errors + j] = W[i, j] / noise[k]
-            A[n + errors + i, 2 * n] = W[i, 2] * drive[k] / noise[k]
-        reflect_columns(A, 2 * n, n)
+                A[n + errors + i, errors + j] = M[k, i, j]
+                A[n + errors + i, n + errors + j] = L[k, i, j]
+            A[n + errors + i, 2 * n] = U[k, i, 0]
+            for c in range(c_many):
+                A[n + errors + i, 2 * n + tail + c] = U[k, i, 1 + c]
+        beyond = rows_A - 2 * n
+        reflect_columns(A, rows_A, 2 * n if beyond > 0 else n)
         for j in range(n):
             logdet += np.log(abs(A[j, j]))
         if keep:
@@ -266,6 +268,17 @@ def sweep(
                 C[i, c] = A[n + i, n + c]
             for c in range(b):
                 C[i, n + c] = A[n + i, 2 * n + c]
+        if beyond > 0:  # redundant couplings speak of the border
+            for i in range(beyond):
+                for c in range(b):
+                    G[b + i, c] = A[2 * n + i, 2 * n + c]
+            for i in range(b):
+                for c in range(b):
+                    G[i, c] = T[i, c]
+            reflect_columns(G[: b + beyond], b + beyond, b)
+            for i in range(b):
+                for c in range(b):
+                    T[i, c] = G[i, c]
     return logdet
 
 
@@ -292,8 +305,8 @@ def back(Rkk: FloatArray, Rkn: FloatArray, D: FloatArray, X: FloatArray) -> None
 
 
 @njit(cache=True)
-def covariances(Rkk: FloatArray, Rkn: FloatArray, axis: FloatArray, cross: FloatArray) -> None:
-    """Marginal covariance of [y, y', y''] (N, 3, 3) and var of the step in y'' (N-1,), borders held fixed (spec 15.3)."""
+def covariances(Rkk: FloatArray, Rkn: FloatArray, axis: FloatArray, lag: FloatArray) -> None:
+    """Covariance of [y, y', y''] (N, 3, 3) and with the next node's (N-1, 3, 3), borders held fixed (spec 15.3)."""
     N, n = Rkk.shape[0], Rkk.shape[1]
     a = n - 3
     P = np.zeros((n, n))
@@ -326,8 +339,9 @@ def covariances(Rkk: FloatArray, Rkn: FloatArray, axis: FloatArray, cross: Float
                     f = G[i, m]
                     for j in range(n):
                         H[i, j] += f * P[m, j]
-            after = P[a + 2, a + 2]
-            between = H[a + 2, a + 2]
+            for i in range(3):
+                for j in range(3):
+                    lag[k, i, j] = H[a + i, a + j]
             for i in range(n):
                 for j in range(n):
                     t = 0.0
@@ -346,8 +360,6 @@ def covariances(Rkk: FloatArray, Rkn: FloatArray, axis: FloatArray, cross: Float
                 P[i, j] += t
                 if j > i:
                     P[j, i] = P[i, j]
-        if k < N - 1:
-            cross[k] = after + P[a + 2, a + 2] - 2.0 * between
         for i in range(3):
             for j in range(3):
                 axis[k, i, j] = P[a + i, a + j]

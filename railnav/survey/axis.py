@@ -4,6 +4,9 @@ The chain (spec 15) runs along the curve. At each node it holds y, y', y'' (dist
 slope, and the correction to the curvature, 1/m) and one correlated error a run (Ornstein-Uhlenbeck in the time that the run took
 between nodes). Curvature as a whole, nominal plus correction, is a random walk; so the prior is on the track and not on the
 corrections, and a new nominal curve changes nothing. Frame offsets are border parameters, common to all chains.
+
+A run with gyroscopic angles also measures the slope y', with a drift of its own as one more state (a random walk in time): the state
+menu of spec 16 in coordinates of the curve. Where a stored chain is refined, its records stand in the place of the random walk.
 """
 
 from __future__ import annotations
@@ -20,6 +23,8 @@ IntArray = NDArray[np.int64]
 
 #: Prior of the first node: distance, m; slope; whole curvature, 1/m.
 FIRST_NODE = (1e3, 1.0, 5e-3)
+#: What is left of that prior's weights where a stored chain, which holds it already, is refined.
+STORED_START = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,6 +51,58 @@ class ErrorModel:
         return ErrorModel(self.white * factor, self.correlated * factor, self.memory, self.total * factor)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Slopes:
+    """Slopes that gyroscopic angles measure: bearing of the track less that of the nominal curve, or its gradient.
+
+    Attributes
+    ----------
+    value, lead, variance : (K, N) array
+        Node means, rad (NaN: none), their place beyond the node, m, and the variance of their white part, rad^2.
+    first : (K,) array
+        Standard deviation of a run's slope error at its first node, rad.
+    walk : (K,) array
+        How it drifts, rad per sqrt(s).
+    """
+
+    value: FloatArray
+    lead: FloatArray
+    variance: FloatArray
+    first: FloatArray
+    walk: FloatArray
+
+    @property
+    def runs(self) -> IntArray:
+        """Rows that measure anything."""
+        return np.flatnonzero(np.isfinite(self.value).any(axis=1)).astype(np.int64)
+
+    def part(self, first: int, last: int) -> Slopes:
+        """Nodes first..last-1."""
+        k = slice(first, last)
+        return replace(self, value=self.value[:, k], lead=self.lead[:, k], variance=self.variance[:, k])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Links:
+    """Whitened rows between neighbouring nodes, and at the last one, that take the place of the curvature's random walk.
+
+    M a_k + L a_(k+1) + U[:, 1:] c = U[:, 0] for the axis a = (y, y', y'') and c border parameters that follow those of the runs.
+
+    Attributes
+    ----------
+    M, L : (N-1, q, 3) array
+    U : (N-1, q, 1 + c) array
+    final, final_value : (f, 3), (f, 1 + c) array
+        The same at the last node.
+    """
+
+    M: FloatArray
+    L: FloatArray
+    U: FloatArray
+    final: FloatArray
+    final_value: FloatArray
+
+
 @dataclass(slots=True, eq=False)
 class Chain:
     """What goes into one chain: K runs of one track, or of its heights.
@@ -67,6 +124,10 @@ class Chain:
         Standard deviation of the second derivative's random walk, per sqrt(m).
     first_bend : float
         Prior of the first node's whole second derivative.
+    slopes : Slopes or None
+        What gyroscopic angles say.
+    links : Links or None
+        What a stored chain says, in place of the random walk and the first node's prior.
     """
 
     step: float
@@ -79,6 +140,8 @@ class Chain:
     bend: FloatArray
     noise: FloatArray
     first_bend: float = FIRST_NODE[2]
+    slopes: Slopes | None = None
+    links: Links | None = None
 
     def part(self, first: int, last: int) -> Chain:
         """Nodes first..last-1 as a chain of their own."""
@@ -92,6 +155,7 @@ class Chain:
             design=self.design[:, k],
             bend=self.bend[k],
             noise=self.noise[first : last - 1],
+            slopes=None if self.slopes is None else self.slopes.part(first, last),
         )
 
 
@@ -110,45 +174,117 @@ class Swept:
 
 @dataclass(slots=True, eq=False)
 class Estimate:
-    """Smoothed y, y', y'' (N, 3), their covariance (N, 3, 3), and E[(step of the whole second derivative)^2] (N-1,)."""
+    """The axis estimated.
+
+    Attributes
+    ----------
+    state : (N, 3) array
+        y, y', y'', smoothed.
+    covariance : (N, 3, 3) array
+        Their covariance, that of the border included.
+    step_power : (N-1,) array
+        E[(step of the whole second derivative)^2].
+    inner, inner_lag : (N, 3, 3), (N-1, 3, 3) array
+        Covariance of a node, and with the next one, the border held fixed.
+    lean : (N, 3, b) array
+        What one metre of each border parameter takes off the state.
+    """
 
     state: FloatArray
     covariance: FloatArray
     step_power: FloatArray
+    inner: FloatArray
+    inner_lag: FloatArray
+    lean: FloatArray
+
+    def part(self, first: int, last: int) -> Estimate:
+        """Nodes first..last-1."""
+        k, j = slice(first, last), slice(first, last - 1)
+        return Estimate(
+            self.state[k], self.covariance[k], self.step_power[j], self.inner[k], self.inner_lag[j], self.lean[k]
+        )
 
 
-def _rows(chain: Chain) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    node, who = np.nonzero(np.isfinite(chain.value).T & np.isfinite(chain.variance).T)
-    first = np.searchsorted(node, np.arange(chain.value.shape[1] + 1)).astype(np.int64)
-    return (
-        first,
-        who.astype(np.int64),
-        np.ascontiguousarray(chain.lead[who, node]),
-        1.0 / np.sqrt(chain.variance[who, node]),
-        np.ascontiguousarray(chain.value[who, node]),
-        np.ascontiguousarray(chain.design[who, node]),
+def smooth_links(step: float, noise: FloatArray, bend: FloatArray) -> Links:
+    """The curvature's random walk as rows between nodes: W (a_(k+1) - F a_k) = W (0, 0, -step of the nominal curvature).
+
+    W is the inverse of the lower Cholesky factor of noise^2 [[h^5/20, h^4/8, h^3/6], [., h^3/3, h^2/2], [., ., h]].
+    """
+    h = step
+    Q = np.array([[h**5 / 20, h**4 / 8, h**3 / 6], [h**4 / 8, h**3 / 3, h**2 / 2], [h**3 / 6, h**2 / 2, h]])
+    scale = np.sqrt(np.diag(Q))  # in units of their sigmas: the factor loses nothing however short the step
+    W = np.linalg.inv(np.linalg.cholesky(Q / np.outer(scale, scale))) / scale
+    F = np.array([[1.0, h, 0.5 * h * h], [0.0, 1.0, h], [0.0, 0.0, 1.0]])
+    weight = (1.0 / noise)[:, None, None]
+    drive = -np.diff(bend)[:, None] * W[:, 2] / noise[:, None]
+    return Links(
+        -(W @ F) * weight, W * weight, np.ascontiguousarray(drive[:, :, None]), np.zeros((0, 3)), np.zeros((0, 1))
     )
 
 
-def sweep(chain: Chain, *, borders: bool = True, keep: bool = True) -> Swept:
-    """Sweep a chain forward; with `borders`, gather what it says of the frame offsets."""
-    K, N = chain.value.shape
-    B = chain.design.shape[2]
-    b = 1 + K * B if borders else 1
-    n = K + 3
-    size = N if keep else 1
-    first, who, lead, weight, value, design = _rows(chain)
+def _rows(chain: Chain) -> tuple[IntArray, IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Observation rows, whitened, by node: CSR, error state, run, axis (rows, 3), weight on the error, value, design."""
+    node, who = np.nonzero(np.isfinite(chain.value).T & np.isfinite(chain.variance).T)
+    w, g = 1.0 / np.sqrt(chain.variance[who, node]), chain.lead[who, node]
+    axis = np.column_stack([w, w * g, 0.5 * w * g * g])
+    state, run, weight = who, who, w
+    value, design = w * chain.value[who, node], w[:, None] * chain.design[who, node]
+    if chain.slopes is not None:
+        runs = chain.slopes.runs
+        column = np.full(len(chain.value), -1)
+        column[runs] = len(chain.value) + np.arange(len(runs))
+        at, which = np.nonzero(np.isfinite(chain.slopes.value).T)
+        v, lead = 1.0 / np.sqrt(chain.slopes.variance[which, at]), chain.slopes.lead[which, at]
+        node = np.concatenate([node, at])
+        order = np.argsort(node, kind="stable")
+        node = node[order]
+        axis = np.concatenate([axis, np.column_stack([np.zeros(len(v)), v, v * lead])])[order]
+        state = np.concatenate([state, column[which]])[order]
+        run = np.concatenate([run, np.full(len(v), -1)])[order]
+        weight = np.concatenate([weight, v])[order]
+        value = np.concatenate([value, v * chain.slopes.value[which, at]])[order]
+        design = np.concatenate([design, np.zeros((len(v), design.shape[1]))])[order]
+    first = np.searchsorted(node, np.arange(chain.value.shape[1] + 1)).astype(np.int64)
+    return first, state.astype(np.int64), run.astype(np.int64), np.ascontiguousarray(axis), weight, value, design
+
+
+def _errors(chain: Chain) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Memory (N-1, E) and sigma of the steps (N-1, E) of the runs' errors, and their sigma at the first node (E,)."""
     memory = np.array([e.memory for e in chain.errors])
     sigma = np.array([max(e.correlated, 1e-4) for e in chain.errors])
-    elapsed = np.maximum(np.abs(np.diff(chain.time, axis=1)), chain.step / 100.0)
-    phi = np.ascontiguousarray(np.exp(-elapsed / memory[:, None]).T)
-    phi = np.minimum(phi, 1.0 - 1e-9)
+    elapsed = np.maximum(np.abs(np.diff(chain.time, axis=1)), chain.step / 100.0).T
+    phi = np.minimum(np.exp(-elapsed / memory), 1.0 - 1e-9)
+    drive = sigma * np.sqrt(1.0 - phi**2)
+    if chain.slopes is not None:
+        runs = chain.slopes.runs
+        phi = np.concatenate([phi, np.ones((len(phi), len(runs)))], axis=1)
+        drive = np.concatenate([drive, chain.slopes.walk[runs] * np.sqrt(elapsed[:, runs])], axis=1)
+        sigma = np.concatenate([sigma, chain.slopes.first[runs]])
+    return np.ascontiguousarray(phi), np.ascontiguousarray(drive), sigma
+
+
+def sweep(chain: Chain, *, borders: bool = True, keep: bool = True) -> Swept:
+    """Sweep a chain forward; with `borders`, gather what it says of the frame offsets and of the borders of its links."""
+    K, N = chain.value.shape
+    B = chain.design.shape[2]
+    links = chain.links or smooth_links(chain.step, chain.noise, chain.bend)
+    more = links.U.shape[2] - 1
+    if more and not borders:
+        raise ValueError("links with a border are swept with borders")
+    b = 1 + K * B + more if borders else 1
+    phi, drive, sigma = _errors(chain)
+    n = phi.shape[1] + 3
+    size = N if keep else 1
+    first, who, run, axis, weight, value, design = _rows(chain)
+    place = np.where(run >= 0, 1 + run * B, -1)
     Rkk, Rkn, D = np.zeros((size, n, n)), np.zeros((size, n, n)), np.zeros((size, n, b))
     T = np.zeros((b, b))
     prior = np.array([1.0 / FIRST_NODE[0], 1.0 / FIRST_NODE[1], 1.0 / chain.first_bend])
+    if chain.links is not None:
+        prior *= STORED_START
     log_det = _kernels.sweep(
-        chain.step, chain.noise, -np.diff(chain.bend), phi, sigma, first, who, lead, weight, value, design,
-        prior, np.array([0.0, 0.0, -chain.bend[0]]), keep, Rkk, Rkn, D, T,
+        phi, drive, sigma, links.M, links.L, links.U, first, who, place, axis, weight, value, design,
+        prior, np.array([0.0, 0.0, -chain.bend[0]]), links.final, links.final_value, keep, Rkk, Rkn, D, T,
     )  # fmt: skip
     return Swept(Rkk, Rkn, D, T[:, 1:], T[:, 0], log_det, float(T[:, 0] @ T[:, 0]))
 
@@ -165,9 +301,12 @@ def solve(chain: Chain, swept: Swept, border: FloatArray, border_covariance: Flo
     X = np.empty((N, n, b))
     _kernels.back(swept.Rkk, swept.Rkn, swept.D, X)
     axis = X[:, n - 3 :, :]
-    state = axis[:, :, 0] - axis[:, :, 1:] @ border
+    lean = axis[:, :, 1:]
+    state = axis[:, :, 0] - lean @ border
+    inner, lag = np.full((N, 3, 3), np.nan), np.zeros((N - 1, 3, 3))
     covariance, cross = np.full((N, 3, 3), np.nan), np.zeros(N - 1)
     if sure:
-        _kernels.covariances(swept.Rkk, swept.Rkn, covariance, cross)
-        covariance += axis[:, :, 1:] @ border_covariance @ axis[:, :, 1:].transpose(0, 2, 1)
-    return Estimate(state, covariance, np.diff(state[:, 2] + chain.bend) ** 2 + cross)
+        _kernels.covariances(swept.Rkk, swept.Rkn, inner, lag)
+        covariance = inner + lean @ border_covariance @ lean.transpose(0, 2, 1)
+        cross = inner[1:, 2, 2] + inner[:-1, 2, 2] - 2.0 * lag[:, 2, 2]
+    return Estimate(state, covariance, np.diff(state[:, 2] + chain.bend) ** 2 + cross, inner, lag, lean)

@@ -22,6 +22,7 @@ from railnav.survey.grouping import tracks_of_line
 from railnav.survey.noise import error_models, run_models
 from railnav.survey.nominal import course, lines, smooth_course
 from railnav.survey.offsets import Offsets, differences, settle
+from railnav.survey.stored import keep_build
 from railnav.survey.surveyed import Surveyed
 from railnav.survey.vertical import Heights, estimate_heights, measured_cant
 
@@ -312,7 +313,9 @@ def _assembled(
     tell("tabulate", len(tracks), len(tracks))
     sections = [TrackSection(t.name, table) for t, table in zip(tracks, tables, strict=True)]
     text = report.compose(survey, tracks, offsets, heights, up, tables)
-    return assemble(frame, sections, provenance={"made_by": "railnav build", "build": text})
+    records = keep_build(survey, tracks, offsets, heights, up)
+    provenance = {"made_by": "railnav build", "build": text}
+    return assemble(frame, sections, provenance=provenance, record_source=lambda: records)
 
 
 def _knots(t: Surveyed, offsets: Offsets, heights: Heights | None, frame: GridFrame, spacing: float) -> KnotTable:

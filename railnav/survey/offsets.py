@@ -55,6 +55,8 @@ class Offsets:
         How far runs of one receiver scatter, m.
     weight : (C,) array
         Weight of each receiver in the datum, sum 1.
+    joint : ((R + C) * B, (R + C) * B) array
+        Covariance of all offsets, the runs' before the receivers', m^2.
     """
 
     run: FloatArray
@@ -63,6 +65,7 @@ class Offsets:
     receiver_covariance: FloatArray
     scatter: FloatArray
     weight: FloatArray
+    joint: FloatArray
 
     def common(self, runs: Sequence[int]) -> FloatArray:
         """Covariance of the mean offset of some runs, (B, B), m^2."""
@@ -153,6 +156,7 @@ def settle(knowledge: Sequence[Knowledge], kind: IntArray, scale: FloatArray, co
         receiver_covariance=P[R * B :, R * B :],
         scatter=scatter,
         weight=weight,
+        joint=P,
     )
 
 

@@ -124,7 +124,7 @@ def cut_ends(track: Surveyed) -> Surveyed:
     nominal = track.nominal.part(a, b + 1)
     e = track.estimate
     if e is not None:
-        e = Estimate(e.state[keep], e.covariance[keep], e.step_power[a:b])
+        e = e.part(a, b + 1)
     return replace(
         track,
         nominal=nominal,

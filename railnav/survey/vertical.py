@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from railnav.survey.axis import Chain, solve, sweep
+from railnav.survey.axis import Chain, ErrorModel, Estimate, solve, sweep
 from railnav.survey.noise import Sample, error_models, run_models
 from railnav.survey.offsets import Knowledge, Offsets, differences, settle
 from railnav.survey.profiles import Profiles
@@ -28,12 +28,32 @@ ROUNDS = 3
 
 @dataclass(slots=True, eq=False)
 class Heights:
-    """Heights of one track at its nodes: (N,) height, m, and variance, m^2; node means left out, of how many."""
+    """Heights of one track at its nodes.
+
+    Attributes
+    ----------
+    height, variance : (N,) array
+        m and m^2.
+    rejected, total : int
+        Node means left out, of how many.
+    runs : tuple of int
+        Runs with heights, in the order of the estimate's border.
+    estimate : Estimate
+        Of the chain.
+    noise : (N-1,) array
+        Random walk of the vertical curvature, 1/m per sqrt(m).
+    models : dict
+        Error model of each kind of receiver in height.
+    """
 
     height: FloatArray
     variance: FloatArray
     rejected: int
     total: int
+    runs: tuple[int, ...]
+    estimate: Estimate
+    noise: FloatArray
+    models: dict[str, ErrorModel]
 
 
 def estimate_heights(
@@ -83,7 +103,7 @@ def estimate_heights(
     axes = [_middle(c, p, offsets.run) for _, p, c, _ in work]
     levels = [0.0] * len(work)
     rejected = [0] * len(work)
-    variances: list[FloatArray] = []
+    estimates: list[Estimate] = []
     for turn in range(ROUNDS):
         swept = []
         for w, (_, part, chain, _) in enumerate(work):
@@ -99,15 +119,24 @@ def estimate_heights(
                 chain.noise = np.full(len(chain.noise), levels[w])
             swept.append(sweep(chain))
         offsets = settle([know(p, s) for (_, p, _, _), s in zip(work, swept, strict=True)], kind, scale, 1)
-        variances = []
+        estimates = []
         for w, ((_, part, chain, _), s) in enumerate(zip(work, swept, strict=True)):
             who = list(part.runs)
             e = solve(chain, s, offsets.run[who, 0], offsets.covariance[np.ix_(who, who)], sure=True)
             axes[w] = e.state[:, 0]
             chain.noise = local_noise(e, levels[w], chain.step)
-            variances.append(e.covariance[:, 0, 0])
-    for w, (i, _, chain, base) in enumerate(work):
-        found[i] = Heights(axes[w] + base, variances[w], rejected[w], int(np.isfinite(chain.value).sum()))
+            estimates.append(e)
+    for w, (i, part, chain, base) in enumerate(work):
+        found[i] = Heights(
+            height=axes[w] + base,
+            variance=estimates[w].covariance[:, 0, 0],
+            rejected=rejected[w],
+            total=int(np.isfinite(chain.value).sum()),
+            runs=part.runs,
+            estimate=estimates[w],
+            noise=chain.noise,
+            models=models,
+        )
     return found, offsets
 
 

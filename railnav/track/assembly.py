@@ -17,6 +17,7 @@ from railnav.units import wrap_angle
 
 if TYPE_CHECKING:
     from railnav.geodesy.grid import GridFrame
+    from railnav.track.records import RecordSource
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -62,6 +63,7 @@ def assemble(
     *,
     join_within: float = 0.5,
     provenance: dict[str, Any] | None = None,
+    record_source: RecordSource | None = None,
 ) -> TrackModel:
     """Join track sections into a model.
 
@@ -79,6 +81,8 @@ def assemble(
         Greatest distance of joined ends, m.
     provenance : dict, optional
         Where the model comes from; JSON values.
+    record_source : callable, optional
+        Gives the records of the surveys behind it.
 
     Returns
     -------
@@ -144,6 +148,7 @@ def assemble(
         movements=movements,
         mileposts=MilePosts(np.array(post_track, np.int64), post[:, 0].copy(), post[:, 1].copy()),
         provenance=dict(provenance or {}),
+        record_source=record_source,
     )
 
 

@@ -24,6 +24,8 @@ from railnav.units import wrap_angle
 if TYPE_CHECKING:
     import networkx as nx
 
+    from railnav.track.records import ModelRecords, RecordSource
+
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
@@ -164,6 +166,8 @@ class TrackModel:
     mileposts : MilePosts
     provenance : dict
         Where the model came from: JSON values only.
+    record_source : callable or None
+        Gives the square-root records of the surveys behind the model (`records`); None where it has none.
     """
 
     frame: GridFrame
@@ -187,6 +191,7 @@ class TrackModel:
     movements: IntArray
     mileposts: MilePosts
     provenance: dict[str, Any] = field(default_factory=dict)
+    record_source: RecordSource | None = field(default=None, repr=False)
     _index: SpatialIndex = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -252,6 +257,14 @@ class TrackModel:
         from railnav.io.geopackage import write_model  # a door upward, named in the import contract
 
         write_model(self, path)
+
+    @property
+    def records(self) -> ModelRecords | None:
+        """What the surveys behind the model know, to refine it with later runs (`railnav.update`); None where nothing is stored.
+
+        Read from the file when asked for, not before.
+        """
+        return None if self.record_source is None else self.record_source()
 
     @property
     def index(self) -> SpatialIndex:
