@@ -9,6 +9,7 @@ ends at their time, as in `railnav.run.ImuStream`.
 from __future__ import annotations
 
 from railnav.inertial.advice import advise_positions
+from railnav.inertial.aiding import Fixes, Ranges, Rests, VehicleMotion, find_rests, without_lever_arm
 from railnav.inertial.alignment import Alignment, coarse_align, level, lever_arm_motion
 from railnav.inertial.allan import AllanCurve, NoiseParameters, allan_deviation, fit_allan
 from railnav.inertial.autonomous import (
@@ -48,6 +49,7 @@ from railnav.inertial.great_circle import (
 )
 from railnav.inertial.heading import VelocityHeading, heading_from_antennas, heading_from_velocity
 from railnav.inertial.inspection import Finding, inspect_log
+from railnav.inertial.integration import AidedSolution, Unknowns, Vehicle, integrate
 from railnav.inertial.loose import ImuNoise, InitialSigma, LooseSolution, integrate_gnss
 from railnav.inertial.mechanization import (
     EARTH_RATE,
@@ -68,6 +70,7 @@ __all__ = [
     "CAUSES",
     "EARTH_RATE",
     "GRADES",
+    "AidedSolution",
     "Alignment",
     "AllanCurve",
     "Diagnosis",
@@ -75,6 +78,7 @@ __all__ = [
     "Finding",
     "FineAlignment",
     "FixedLatitude",
+    "Fixes",
     "GravityField",
     "ImuNoise",
     "InitialSigma",
@@ -83,8 +87,10 @@ __all__ = [
     "NavigationState",
     "NoiseParameters",
     "Position",
+    "Ranges",
     "ReferenceLongitude",
     "Rest",
+    "Rests",
     "ScalarControl",
     "SensorGrade",
     "Solvability",
@@ -93,6 +99,9 @@ __all__ = [
     "TriadCalibration",
     "TriadModel",
     "TriadSamples",
+    "Unknowns",
+    "Vehicle",
+    "VehicleMotion",
     "VelocityHeading",
     "advise_positions",
     "advise_turns",
@@ -105,6 +114,7 @@ __all__ = [
     "error_dynamics",
     "error_transition",
     "feed_back",
+    "find_rests",
     "fine_align",
     "finite_rotation",
     "fit_allan",
@@ -122,6 +132,7 @@ __all__ = [
     "heading_from_antennas",
     "heading_from_velocity",
     "inspect_log",
+    "integrate",
     "integrate_gnss",
     "level",
     "lever_arm_motion",
@@ -143,4 +154,5 @@ __all__ = [
     "turned_rate",
     "vector_calibration",
     "vehicle_design",
+    "without_lever_arm",
 ]

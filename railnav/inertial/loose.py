@@ -1,15 +1,12 @@
-"""Loosely coupled, closed loop: strapdown, a square-root filter of fifteen errors, and GNSS positions and velocities."""
+"""Loosely coupled, closed loop, in its plainest form: GNSS positions and velocities, fifteen errors; the work is `integration`'s."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from railnav.errors import EstimationError
-from railnav.inertial.error_model import position_scale
 from railnav.inertial.mechanization import GravityField, NavigationState, Trajectory
 
 FloatArray = NDArray[np.float64]
@@ -184,112 +181,49 @@ def integrate_gnss(
     >>> out.sigma[-1, :3].round(1)
     array([1., 1., 1.])
     """
-    from railnav.inertial._kernels import loose_kernel
+    from railnav.estimation._kernels import triangularize_rows
+    from railnav.inertial.aiding import Fixes
+    from railnav.inertial.integration import Vehicle, integrate
 
-    t = np.asarray(time, dtype=np.float64)
-    w, f = _table("rate_ib_b", rate_ib_b), _table("specific_force_b", specific_force_b)
-    if t.ndim != 1 or not len(t) == len(w) == len(f) or not len(t):
-        raise ValueError(f"needs one time, rate and specific force a sample, not {t.shape}, {w.shape}, {f.shape}")
-    interval = np.diff(t, prepend=start_time)
-    wrong = np.flatnonzero(~(interval > 0.0))
-    if wrong.size:
-        raise ValueError(f"time does not increase at sample {wrong[0]}: sort the samples, and start before the first")
-    if interval.max() > 0.5:
-        raise EstimationError(
-            f"{interval.max():.2f} s between samples {int(np.argmax(interval)) - 1} and {int(np.argmax(interval))}: cut the log there"
-        )
-    stamps = np.asarray(fix_time, dtype=np.float64)
-    position, velocity = _table("fix_position", fix_position), _table("fix_velocity_n", fix_velocity_n)
-    if stamps.ndim != 1 or not len(stamps) == len(position) == len(velocity):
-        raise ValueError(
-            f"needs one time, position and velocity a fix, not {stamps.shape}, {position.shape}, {velocity.shape}"
-        )
-    if not np.isfinite(stamps).all() or np.any(np.diff(stamps) <= 0.0):
-        raise ValueError("fix_time must be finite and increase")
-    if len(position) and np.abs(position[:, 0]).max() > math.pi / 2:
-        raise ValueError("a fix lies beyond the pole: latitudes are in radians")
-    variance = np.empty((len(stamps), 6))
-    for name, sigmas, place in (
-        ("sigma_position", sigma_position, slice(0, 3)),
-        ("sigma_velocity", sigma_velocity, slice(3, 6)),
-    ):
-        s = np.broadcast_to(np.asarray(sigmas, dtype=np.float64), (len(stamps), 3))
-        if not (np.isfinite(s).all() and np.all(s > 0.0)):
-            raise ValueError(f"{name} must be positive and finite")
-        variance[:, place] = s * s
-    inside = np.flatnonzero((stamps > start_time) & (stamps <= t[-1]))
-    row = np.searchsorted(t, stamps[inside], side="left")
     arm = np.asarray(lever_arm_b, dtype=np.float64)
     if arm.shape != (3,) or not np.isfinite(arm).all():
         raise ValueError("lever_arm_b must be three finite numbers")
-    scale = position_scale(start, gravity)
-    sigma0 = np.concatenate(
-        [
-            np.asarray(initial.position, dtype=np.float64) / scale,
-            np.asarray(initial.velocity, dtype=np.float64),
-            np.asarray(initial.attitude, dtype=np.float64),
-            np.full(3, initial.gyro_bias),
-            np.full(3, initial.accelerometer_bias),
-        ]
+    stamps = np.asarray(fix_time, dtype=np.float64)
+    shapes = [np.shape(x) for x in (stamps, fix_position, fix_velocity_n)]
+    if stamps.ndim != 1 or shapes[1] != (len(stamps), 3) or shapes[2] != (len(stamps), 3):
+        raise ValueError(f"needs one time, position and velocity a fix, not {', '.join(map(str, shapes))}")
+    if not np.isfinite(stamps).all() or np.any(np.diff(stamps) <= 0.0):
+        raise ValueError("fix_time must be finite and increase")
+    fixes = Fixes(
+        stamps,
+        *(np.asarray(x, dtype=np.float64) for x in (fix_position, sigma_position, fix_velocity_n, sigma_velocity)),
     )
-    if sigma0.shape != (15,) or not (np.isfinite(sigma0).all() and np.all(sigma0 > 0.0)):
-        raise ValueError("initial sigmas must be three, three, three and two positive numbers")
-    P_sqrt = np.diag(sigma0)
-    times = np.array([noise.gyro_correlation_time, noise.accelerometer_correlation_time])
-    densities = np.array(
-        [
-            noise.velocity_random_walk,
-            noise.angle_random_walk,
-            noise.gyro_instability * math.sqrt(2.0 / times[0]),
-            noise.accelerometer_instability * math.sqrt(2.0 / times[1]),
-        ]
+    got = integrate(
+        start,
+        initial,
+        time,
+        rate_ib_b,
+        specific_force_b,
+        noise,
+        start_time=start_time,
+        fixes=fixes,
+        vehicle=Vehicle(antenna_arm_b=(float(arm[0]), float(arm[1]), float(arm[2]))),
+        gravity=gravity,
+        gate=gate,
     )
-    n, m = len(t), len(inside)
-    out, bias, sigma = np.empty((n + 1, 10)), np.zeros((n + 1, 6)), np.empty((n + 1, 15))
-    out[0] = [start.latitude, start.longitude, start.height, *start.velocity_n, *start.quaternion_nb]
-    sigma[0] = sigma0
-    nis, used = np.zeros((m, 6)), np.zeros((m, 6), dtype=np.bool_)
-    done = loose_kernel(
-        w * interval[:, None],
-        f * interval[:, None],
-        interval,
-        (gravity or GravityField()).flat(),
-        P_sqrt,
-        densities,
-        times,
-        arm,
-        row,
-        t[row] - stamps[inside],
-        np.ascontiguousarray(np.hstack([position, velocity])[inside]),
-        np.ascontiguousarray(variance[inside]),
-        float(gate),
-        out,
-        bias,
-        sigma,
-        nis,
-        used,
+    # states from biases, attitude, velocity, position into the order of `ErrorState`
+    root = np.ascontiguousarray(got.P_sqrt[[12, 13, 14, 9, 10, 11, 6, 7, 8, 0, 1, 2, 3, 4, 5]])
+    triangularize_rows(root, 15)
+    bg, ba = got.parameters["gyro_bias"], got.parameters["accelerometer_bias"]
+    slow = (got.parameter_sigma["gyro_bias"], got.parameter_sigma["accelerometer_bias"])
+    none = np.empty((0, 6))
+    return LooseSolution(
+        got.trajectory,
+        bg,
+        ba,
+        np.hstack([got.sigma, *slow]),
+        got.nis.get("fixes", none),
+        got.used.get("fixes", none.astype(np.bool_)),
+        got.kept["fixes"],
+        root,
     )
-    if done < n:
-        raise EstimationError(
-            f"within 0.1 degrees of a pole, or lost, at sample {done}: check start, units, axes and sigmas"
-        )
-    refused = np.convolve(~used.any(axis=1), np.ones(10), "valid") if m >= 10 else np.zeros(0)
-    if np.any(refused == 10):
-        k = int(inside[np.argmax(refused == 10)])
-        raise EstimationError(
-            f"ten fixes in a row from {stamps[k]:.1f} s on are refused entirely: the filter has lost the vehicle; check the heading at the "
-            "start, the axes and the sigmas"
-        )
-    sigma[:, :3] *= scale
-    trajectory = Trajectory(np.concatenate([[start_time], t]), out[:, 0], out[:, 1], out[:, 2], out[:, 3:6], out[:, 6:])
-    return LooseSolution(trajectory, bias[:, :3], bias[:, 3:], sigma, nis, used, inside, P_sqrt)
-
-
-def _table(name: str, value: ArrayLike) -> FloatArray:
-    x = np.asarray(value, dtype=np.float64)
-    if x.ndim != 2 or x.shape[1] != 3:
-        raise ValueError(f"{name} must have the shape (n, 3), not {x.shape}")
-    bad = np.flatnonzero(~np.isfinite(x).all(axis=1))
-    if bad.size:
-        raise ValueError(f"{name} of row {bad[0]} is not finite; leave the row out or fill the gap")
-    return x
