@@ -78,6 +78,26 @@ PAGES = {
                 "python benchmarks/parallel.py",
             ),
             Section(
+                "monte-carlo",
+                "What the navigator promises, by seeded Monte Carlo",
+                "Simulated, on the bundled line, each case with its bar. The open-sky bar comes from a filter that is told the noise (white "
+                "1.5 m); the navigator assumes coloured errors, as receivers have them, and is shown on both.",
+                "python benchmarks/monte_carlo.py",
+            ),
+            Section(
+                "faults",
+                "Named faults",
+                "What goes wrong with sensors, simulated, and what the navigator makes of it. `railnav simulate --list-faults` says what each is.",
+                "python benchmarks/faults.py",
+            ),
+            Section(
+                "gaps",
+                "Gaps cut into a real line's runs",
+                "GNSS alone on a train: nothing else tells how fast it runs inside a gap.",
+                "python benchmarks/gaps.py",
+                real_data=True,
+            ),
+            Section(
                 "outages",
                 "Real drive without a map: the loose inertial filter with RTK withheld",
                 "A car with RTK GNSS and a low-cost IMU; the fixes left out are the truth. Causal, no constraints.",
