@@ -48,6 +48,10 @@ class GnssStream:
         Reference point to antenna: forward, right, down, m.
     frame : str
         The frame that the coordinates came in, as run.toml names it; reading turned them to WGS 84.
+    epoch : float or None
+        Decimal year of the coordinates, where run.toml names one; otherwise that of the run's start.
+    fixed_to : str
+        The plate-fixed datum that reading carried the coordinates to and that stands for WGS 84; empty where none is named.
     receiver : str
         Kind of receiver, where run.toml names it; otherwise empty.
     """
@@ -68,6 +72,8 @@ class GnssStream:
     lever_arm_b: FloatArray = field(default_factory=_zeros3)
     frame: str = "WGS84"
     receiver: str = ""
+    epoch: float | None = None
+    fixed_to: str = ""
 
     def __len__(self) -> int:
         return len(self.time)

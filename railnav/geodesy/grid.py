@@ -1,8 +1,7 @@
-"""The projected plane of a model: one coordinate system, one pinned transformation to it, and its true scale.
+"""Choosing the projected plane of a model: one coordinate system, and one pinned transformation to it.
 
-`choose_frame` picks the plane and pins one PROJ operation from WGS 84; `GridFrame` carries the operation's own text, so that
-a model read years later gives the same numbers whatever the registry then prefers. Distances on the ground follow from the
-projection's scale, the height and the datum's own scale: s = ((L/6)(1/k1 + 4/km + 1/k2))(1 + h/R_A), joined with the rise.
+`choose_frame` picks the plane by where the data lies, `frame_for_grid` by coordinates that are in it already; both pin one
+operation from WGS 84 in a `railnav.geodesy.plane.GridFrame`.
 """
 
 from __future__ import annotations
@@ -10,31 +9,22 @@ from __future__ import annotations
 import math
 import warnings
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from railnav.errors import CrsError
+from railnav.geodesy.datums import datum_shift, find_datum, registered_shift, stand_in
+from railnav.geodesy.plane import GridFrame, broadcast, refuse_not_finite
 from railnav.geodesy.projection import projection_of
-from railnav.geodesy.transformation import (
-    DEGREE,
-    PER_DEGREE,
-    Extent,
-    forward,
-    inverse,
-    pin_operation,
-    registered,
-    shortened,
-    wrapped_deg,
-)
+from railnav.geodesy.transformation import Extent, pin_operation, shortened, wrapped_deg
 
 if TYPE_CHECKING:
     import pyproj
 
-FloatArray = NDArray[np.float64]
+__all__ = ["GridFrame", "choose_frame", "frame_for_grid"]
 
 #: Largest |k - 1| of a usable plane: beyond, bearings and lengths are those of another country.
 _LARGEST_DISTORTION = 0.01
@@ -62,290 +52,6 @@ _PULKOVO = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class GridFrame:
-    """A projected plane g (easting, northing, height) with the one transformation from WGS 84 pinned to it.
-
-    Values of this class compare, hash and pickle by their five fields; nothing else is kept in them.
-
-    Attributes
-    ----------
-    crs_wkt : str
-        The coordinate system, WKT2:2019 on one line (QGIS and GDAL open it).
-    name : str
-        Its name for people.
-    pipeline : str
-        The PROJ pipeline that is run: WGS 84 longitude, latitude (degrees), ellipsoidal height (m) to easting, northing,
-        height (m). Heights are above the ellipsoid of the frame's own datum.
-    operation : str
-        What the registry calls that operation.
-    accuracy : float
-        Its stated accuracy, m; 0 where the operation defines the frame.
-
-    Notes
-    -----
-    Coordinates may be scalars or arrays of one broadcast shape; the answer has that shape. A coordinate that is not finite
-    or that the projection cannot take raises `CrsError`. A scalar position costs about 2 microseconds, an array 0.5
-    microseconds a point.
-
-    Examples
-    --------
-    >>> frame = choose_frame(np.radians(47.5), np.radians(19.1))
-    >>> frame.name, frame.accuracy
-    ('WGS 84 / Gauss-Kruger zone 4', 0.0)
-    """
-
-    crs_wkt: str
-    name: str
-    pipeline: str
-    operation: str
-    accuracy: float
-
-    def to_grid(
-        self, latitude: ArrayLike, longitude: ArrayLike, height: ArrayLike | None = None
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Grid coordinates of WGS 84 positions.
-
-        Parameters
-        ----------
-        latitude, longitude : float or array
-            WGS 84, rad.
-        height : float or array, optional
-            Above the WGS 84 ellipsoid, m; where it is missing (None or NaN) the position is taken at height 0 and the
-            height returned is NaN.
-
-        Returns
-        -------
-        easting, northing, height : array of the broadcast shape
-            m.
-
-        Raises
-        ------
-        CrsError
-            A position that is not finite or that the projection cannot take.
-
-        Examples
-        --------
-        >>> frame = choose_frame(np.radians(47.5), np.radians(21.0))
-        >>> easting, northing, height = frame.to_grid(np.radians(47.5), np.radians(21.0), 120.0)
-        >>> round(float(easting), 3), round(float(northing), 3), round(float(height), 3)
-        (4500000.0, 5262834.867, 120.0)
-        """
-        if isinstance(latitude, float) and isinstance(longitude, float) and isinstance(height, float):  # one live fix
-            one = forward(self.pipeline, longitude * PER_DEGREE, latitude * PER_DEGREE, height)
-            if math.isfinite(one[0]) and math.isfinite(one[1]) and math.isfinite(one[2]):
-                return one
-        latitude, longitude, height_, missing = _positions(latitude, longitude, height)
-        easting, northing, up = forward(self.pipeline, longitude * PER_DEGREE, latitude * PER_DEGREE, height_)
-        _refuse_unprojected(self, (easting, northing, up), latitude, longitude, geodetic=True)
-        return _shaped(easting, latitude), _shaped(northing, latitude), _shaped(np.where(missing, np.nan, up), latitude)
-
-    def to_geodetic(
-        self, easting: ArrayLike, northing: ArrayLike, height: ArrayLike | None = None
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """WGS 84 positions of grid coordinates: the inverse of `to_grid`.
-
-        Parameters
-        ----------
-        easting, northing : float or array
-            Grid, m.
-        height : float or array, optional
-            Grid height, m; missing (None or NaN) is treated as 0 and returned as NaN.
-
-        Returns
-        -------
-        latitude, longitude : array of the broadcast shape
-            WGS 84, rad.
-        height : array of the broadcast shape
-            Above the WGS 84 ellipsoid, m.
-
-        Raises
-        ------
-        CrsError
-            A position that is not finite or lies outside the plane.
-
-        Examples
-        --------
-        >>> frame = choose_frame(np.radians(47.5), np.radians(21.0))
-        >>> latitude, longitude, _ = frame.to_geodetic(4500000.0, 5262834.867)
-        >>> round(float(np.degrees(latitude)), 6), round(float(np.degrees(longitude)), 6)
-        (47.5, 21.0)
-        """
-        if isinstance(easting, float) and isinstance(northing, float) and isinstance(height, float):
-            longitude, latitude, up = inverse(self.pipeline, easting, northing, height)
-            if math.isfinite(longitude) and math.isfinite(latitude) and math.isfinite(up):
-                return latitude * DEGREE, longitude * DEGREE, up
-        easting, northing, height_, missing = _positions(easting, northing, height)
-        longitude, latitude, up = inverse(self.pipeline, easting, northing, height_)
-        _refuse_unprojected(self, (longitude, latitude, up), easting, northing, geodetic=False)
-        return (
-            _shaped(latitude * DEGREE, easting),
-            _shaped(longitude * DEGREE, easting),
-            _shaped(np.where(missing, np.nan, up), easting),
-        )
-
-    def convergence(self, easting: ArrayLike, northing: ArrayLike) -> FloatArray:
-        """Grid convergence: the true azimuth of grid north, rad; heading = grid_bearing + convergence.
-
-        Parameters
-        ----------
-        easting, northing : float or array
-            Grid, m.
-
-        Returns
-        -------
-        array of the broadcast shape
-            rad, in (-pi, pi]; positive east of the central meridian in the northern hemisphere.
-
-        Notes
-        -----
-        Of the projection alone: true north is that of the frame's own datum, within 4e-5 rad of that of WGS 84. Closed
-        for the transverse Mercator (Karney's series, 1e-14 rad); by derivatives of the projection otherwise (1e-11 rad).
-
-        References
-        ----------
-        Karney, C. F. F.: Transverse Mercator with an accuracy of a few nanometers. J. Geodesy 85 (2011), eqs 24 to 29.
-
-        Examples
-        --------
-        >>> frame = choose_frame(np.radians(47.5), np.radians(21.0))
-        >>> round(float(np.degrees(frame.convergence(4600000.0, 5263000.0))), 4)
-        0.9784
-        """
-        return self._factor(1, easting, northing)
-
-    def point_scale(self, easting: ArrayLike, northing: ArrayLike) -> FloatArray:
-        """Point scale of the projection, k: grid metres per metre on the ellipsoid of the frame's datum.
-
-        Parameters
-        ----------
-        easting, northing : float or array
-            Grid, m.
-
-        Returns
-        -------
-        array of the broadcast shape
-            k; the square root of the areal scale where the projection is not exactly conformal.
-
-        Examples
-        --------
-        >>> frame = choose_frame(np.radians(47.5), np.radians(21.0))
-        >>> round(float(frame.point_scale(4600000.0, 5263000.0) - 1) * 1e6, 1)  # ppm, 100 km off the meridian
-        122.8
-        """
-        return self._factor(2, easting, northing)
-
-    def _factor(self, which: int, easting: ArrayLike, northing: ArrayLike) -> FloatArray:
-        """One of latitude, convergence, point scale."""
-        projection = projection_of(self.pipeline)
-        if isinstance(easting, float) and isinstance(northing, float) and math.isfinite(easting + northing):
-            value: FloatArray = projection.factors(np.array([easting]), np.array([northing]))[which][0]
-            return value
-        east, north = _broadcast(easting, northing)
-        _refuse_not_finite(east, north)
-        return _shaped(projection.factors(east.ravel(), north.ravel())[which], east)
-
-    def ground_scale(
-        self, easting: ArrayLike, northing: ArrayLike, height: ArrayLike | None, grid_bearing: ArrayLike
-    ) -> FloatArray:
-        """Grid metres per horizontal metre on the ground in a direction, k/(1 + h/R_A), with the datum's own scale.
-
-        Parameters
-        ----------
-        easting, northing : float or array
-            Grid, m.
-        height : float or array or None
-            Grid height, m; missing (None or NaN) means height 0.
-        grid_bearing : float or array
-            Direction from grid north, rad.
-
-        Returns
-        -------
-        array of the broadcast shape
-            Scale: divide a horizontal grid length by it to have ground metres.
-
-        Notes
-        -----
-        R_A is the Euler radius in the direction's true azimuth. A datum joined to WGS 84 with a scale (DHDN 6.7 ppm,
-        DB_REF 8.0 ppm, Pulkovo 1942 -0.22 ppm) has metres of another length than the ground's; that is in the figure.
-
-        Examples
-        --------
-        >>> frame = choose_frame(np.radians(47.5), np.radians(21.0))
-        >>> round(float(frame.ground_scale(4500000.0, 5263000.0, 100.0, 0.0) - 1) * 1e6, 1)  # ppm, on the meridian
-        -15.7
-        """
-        easting, northing, height_, bearing = _broadcast(
-            easting, northing, 0.0 if height is None else height, grid_bearing
-        )
-        _refuse_not_finite(easting, northing, bearing)
-        height_ = np.where(np.isnan(height_), 0.0, height_)
-        scale = projection_of(self.pipeline).line_scale(
-            easting.ravel(), northing.ravel(), height_.ravel(), bearing.ravel()
-        )
-        return _shaped(scale, easting)
-
-    def ground_length(
-        self,
-        easting_1: ArrayLike,
-        northing_1: ArrayLike,
-        height_1: ArrayLike | None,
-        easting_2: ArrayLike,
-        northing_2: ArrayLike,
-        height_2: ArrayLike | None,
-    ) -> FloatArray:
-        """True 3-D length on the ground of straight grid segments with even rise, m.
-
-        s_ell = L (1/k1 + 4/km + 1/k2)/6, s = sqrt((s_ell (1 + h_m/R_A))^2 + (h2 - h1)^2), over the datum's own scale.
-
-        Parameters
-        ----------
-        easting_1, northing_1, easting_2, northing_2 : float or array
-            Ends, grid, m.
-        height_1, height_2 : float or array or None
-            Their grid heights, m; where either is missing (None or NaN) the length is horizontal at height 0.
-
-        Returns
-        -------
-        array of the broadcast shape
-            m.
-
-        Notes
-        -----
-        Within 0.002 ppm of ECEF for segments of 1 m to 5 km, 200 km off the central meridian, heights to 800 m and
-        slopes to 3 % (tests/geodesy/test_grid.py asks for 0.05).
-
-        References
-        ----------
-        `spec/track_geometry.md`, section 1.6.
-
-        Examples
-        --------
-        >>> frame = choose_frame(np.radians(47.5), np.radians(21.0))
-        >>> round(float(frame.ground_length(4600000.0, 5263000.0, 200.0, 4600000.0, 5264000.0, 200.0)), 4)
-        999.9086
-        """
-        nothing = np.nan
-        e1, n1, h1, e2, n2, h2 = _broadcast(
-            easting_1,
-            northing_1,
-            nothing if height_1 is None else height_1,
-            easting_2,
-            northing_2,
-            nothing if height_2 is None else height_2,
-        )
-        _refuse_not_finite(e1, n1, e2, n2)
-        flat = np.isnan(h1) | np.isnan(h2)
-        h1, h2 = np.where(flat, 0.0, h1), np.where(flat, 0.0, h2)
-        length = projection_of(self.pipeline).ground_length(*(v.ravel() for v in (e1, n1, h1, e2, n2, h2)))
-        return _shaped(length, e1)
-
-    @property
-    def authority(self) -> tuple[str, int] | None:
-        """Registry and code, e.g. ("EPSG", 28409), or None for a system that no registry lists."""
-        return _authority(self.crs_wkt)
-
-
 def choose_frame(
     latitude: ArrayLike,
     longitude: ArrayLike,
@@ -353,6 +59,7 @@ def choose_frame(
     crs: Any = None,
     zone_width: int = 6,
     ellipsoid: str = "wgs84",
+    operation: str | None = None,
 ) -> GridFrame:
     """Choose the plane for data and pin the one transformation to it.
 
@@ -361,15 +68,19 @@ def choose_frame(
     latitude, longitude : float or array
         Where the data lies, WGS 84, rad. The zone follows from the middle of all but the outermost half per cent of the
         longitudes, so that a few wild fixes do not move it.
-    crs : str or pyproj.CRS, optional
+    crs : str, pyproj.CRS or GridFrame, optional
         Any projected system in metres that points east and north: "EPSG:2056", WKT, a PROJ string; or "gk6", "gk3" for
-        the Gauss-Krueger zone of that width.
+        the Gauss-Krueger zone of that width; or a plane that is pinned already (`railnav.io.frame_file.read_frame`).
     zone_width : {6, 3}
         Width of the Gauss-Krueger zones in degrees: zone z = floor(lon/6) + 1 with central meridian 6 z - 3, or
         z = round(lon/3) with 3 z; scale 1 on it, false easting z 1e6 + 500,000 m.
     ellipsoid : {"wgs84", "krassowsky", "bessel"}
         "wgs84": the pure projection of WGS 84, no datum shift, accuracy 0; "krassowsky": Pulkovo 1942,
         or west of it 1942(83) or 1942(58), whichever is joined to WGS 84 most closely; "bessel": DB_REF (3-degree zones 2 to 5, Germany).
+    operation : str, optional
+        The link of the plane's datum to WGS 84 where several are published: an EPSG code ("EPSG:1267"), or "table" for the
+        chain of `railnav.geodesy.datums` (GOST 32453-2017, with GSK-2011 standing for WGS 84). By default the most accurate
+        that PROJ can run, and the table where PROJ has none.
 
     Returns
     -------
@@ -406,7 +117,14 @@ def choose_frame(
     if crs is not None:
         if kind != "wgs84":
             raise CrsError(f"crs={crs!r} brings its own ellipsoid; leave out ellipsoid={ellipsoid!r}")
-        return _pin(_read_crs(crs), extent, asked=str(crs))
+        if isinstance(crs, GridFrame):
+            if operation is not None:
+                raise CrsError(f"{crs.name} is pinned already; leave out operation={operation!r}")
+            _refuse_distorted(crs, extent, crs.name, crs.name)
+            return crs
+        return _pin(_read_crs(crs), extent, asked=str(crs), operation=operation)
+    if operation is not None:
+        raise CrsError(f"operation={operation!r} goes with crs=; name the plane")
     if kind == "wgs84":
         return _pin(_gauss_krueger_wgs84(extent.longitude, zone_width), extent, asked=f"gk{zone_width}")
     if kind.startswith("krass"):
@@ -415,15 +133,17 @@ def choose_frame(
     return _pin(_read_crs(f"EPSG:{code}"), extent, asked=f"EPSG:{code}")
 
 
-def frame_for_grid(easting: ArrayLike, northing: ArrayLike, *, crs: Any) -> GridFrame:
+def frame_for_grid(easting: ArrayLike, northing: ArrayLike, *, crs: Any, operation: str | None = None) -> GridFrame:
     """Pin the transformation of a plane in which coordinates are given already.
 
     Parameters
     ----------
     easting, northing : float or array
         Where the data lies, in that plane, m.
-    crs : str or pyproj.CRS
+    crs : str, pyproj.CRS or GridFrame
         The plane, as for `choose_frame`; "gk6" and "gk3" read the zone from the false easting, int(easting/1e6).
+    operation : str, optional
+        The link to WGS 84, as for `choose_frame`.
 
     Returns
     -------
@@ -444,10 +164,13 @@ def frame_for_grid(easting: ArrayLike, northing: ArrayLike, *, crs: Any) -> Grid
     """
     from pyproj import Proj
 
-    east, north = (v.ravel() for v in _broadcast(easting, northing))
-    _refuse_not_finite(east, north)
+    east, north = (v.ravel() for v in broadcast(easting, northing))
+    refuse_not_finite(east, north)
     if len(east) == 0:
         raise CrsError("no coordinates to place a plane by; give at least one")
+    if isinstance(crs, GridFrame):
+        latitude, longitude, _ = crs.to_geodetic(east, north, 0.0)
+        return choose_frame(latitude, longitude, crs=crs, operation=operation)
     if isinstance(crs, str) and crs.strip().lower() in {"gk3", "gk6"}:
         width = int(crs.strip()[2])
         zone = int(np.median(east) // 1e6)
@@ -470,7 +193,7 @@ def frame_for_grid(easting: ArrayLike, northing: ArrayLike, *, crs: Any) -> Grid
             f"coordinates {i + 1} (easting {east[i]:.0f}, northing {north[i]:.0f}) do not lie in {_label(system, crs)}; "
             "check the plane, and that easting and northing are not exchanged"
         )
-    return _pin(system, Extent.of(np.radians(lat), np.radians(lon)), asked=str(crs))
+    return _pin(system, Extent.of(np.radians(lat), np.radians(lon)), asked=str(crs), operation=operation)
 
 
 def _zone_6(longitude_deg: float) -> int:
@@ -586,24 +309,85 @@ def _label(system: pyproj.CRS, asked: Any) -> str:
     return f"{shortened(asked)} ({system.name})" if system.name not in {"unknown", "unnamed"} else shortened(asked)
 
 
-def _pin(system: pyproj.CRS, extent: Extent, *, asked: str) -> GridFrame:
+def _pin(system: pyproj.CRS, extent: Extent, *, asked: str, operation: str | None = None) -> GridFrame:
     """Pin one transformation from WGS 84 to a projected system and see that it serves the data."""
     from pyproj import CRS
 
     label = _label(system, asked)
     _refuse_far_outside(system, extent, label)
-    pipeline, operation, accuracy = pin_operation(CRS.from_epsg(4979), system, extent)
+    if operation is not None and operation.strip().lower() == "table":
+        pipeline, words, accuracy = chained(system, extent, label)
+    elif operation is not None and (named := _by_code(system, extent, label, operation)) is not None:
+        pipeline, words, accuracy = named
+    else:
+        try:
+            pipeline, words, accuracy = pin_operation(CRS.from_epsg(4979), system, extent, operation=operation)
+        except CrsError:
+            datum = find_datum(system)
+            if operation is not None or system.is_bound or datum is None or datum.name not in ("PZ-90.11", "PZ-90.02"):
+                raise  # of the others PROJ runs what holds here; the table would be taken beyond its country
+            pipeline, words, accuracy = chained(system, extent, label)
     name = system.name if system.name not in {"unknown", "unnamed"} else shortened(asked)
-    frame = GridFrame(" ".join(str(system.to_wkt("WKT2_2019")).split()), name, pipeline, operation, accuracy)
+    frame = GridFrame(" ".join(str(system.to_wkt("WKT2_2019")).split()), name, pipeline, words, accuracy)
     _refuse_distorted(frame, extent, label, asked)
     return frame
 
 
-@lru_cache(maxsize=16)
-def _authority(crs_wkt: str) -> tuple[str, int] | None:
-    from pyproj import CRS
+def chained(system: pyproj.CRS, extent: Extent, label: str) -> tuple[str, str, float]:
+    """The chain of the datum table to a projected system: pipeline, name, accuracy.
 
-    return registered(CRS.from_wkt(crs_wkt))
+    Its datum's plate-fixed companion (GSK-2011 in the east, ETRF2000 in the west) stands for WGS 84, as in the registry's own
+    null transformations; `geodetic_frame(..., fixed_to=)` brings receivers to the same.
+    """
+    datum = find_datum(system)
+    if datum is None:
+        raise CrsError(
+            f"the datum of {label} is not in the table of railnav.geodesy.datums; leave the operation to PROJ"
+        )
+    companion = stand_in(datum)
+    latitude, longitude = np.radians([extent.south, extent.north]), np.radians([extent.west, extent.east])
+    shift = datum_shift(companion, datum.name, latitude, longitude, target_epoch=2011.0 if datum.moving else None)
+    return _through(system, shift.proj, label), f"WGS 84 as {companion}; {shift.operation}", shift.accuracy
+
+
+def _by_code(system: pyproj.CRS, extent: Extent, label: str, code: str) -> tuple[str, str, float] | None:
+    """A registry's Helmert transformation between the plane's datum and WGS 84, run as its numbers say; None for other kinds."""
+    found = registered_shift(code) if code.partition(":")[2].strip().isdigit() else None
+    if found is None:
+        return None
+    base = system.geodetic_crs
+    ends = [found.source, found.target]
+    if base is None or base.name not in ends or not any(end.startswith("WGS 84") for end in ends):
+        raise CrsError(f"{code} leads from {found.source} to {found.target}, not from {label} to WGS 84")
+    if found.shift.moves or found.accuracy < 0:
+        raise CrsError(f"{code} ({found.name}) has no fixed parameters of stated accuracy; choose another")
+    if found.bounds is not None:
+        west, south, east, north = found.bounds
+        beyond = max(extent.north - north, south - extent.south)
+        if west <= east:
+            beyond = max(beyond, extent.east - east, west - extent.west)
+        if beyond > _AREA_MARGIN_DEG:
+            raise CrsError(f"{code} ({found.name}) does not hold about {extent}; choose another")
+    backwards = found.source == base.name
+    words = f"{'Inverse of ' if backwards else ''}{found.name}"
+    return _through(system, found.shift.step(inverse=backwards), label), words, found.accuracy
+
+
+def _through(system: pyproj.CRS, steps: str, label: str) -> str:
+    """The pipeline from WGS 84 by geocentric steps to a projected system."""
+    from pyproj import CRS, Transformer
+
+    base = system.geodetic_crs
+    if base is None or system.is_compound:
+        raise CrsError(f"{label} is no plane on a geodetic datum; use its horizontal part alone")
+    plain = CRS.from_wkt(str(system.to_wkt("WKT2_2019"))).to_2d()
+    projection = str(Transformer.from_crs(base.to_2d(), plain, always_xy=True).definition)
+    turned = "step proj=unitconvert xy_in=deg xy_out=rad "
+    if turned not in projection or base.ellipsoid is None or (base.prime_meridian and base.prime_meridian.longitude):
+        raise CrsError(f"the projection of {label} cannot be written down as steps after longitude and latitude")
+    ellipsoid = f"a={base.ellipsoid.semi_major_metre:.15g} rf={base.ellipsoid.inverse_flattening:.15g}"
+    pipeline = f"proj=pipeline {turned}step proj=cart ellps=WGS84 {steps} step inv proj=cart {ellipsoid} step "
+    return " ".join((pipeline + projection.split(turned, 1)[1].removeprefix("step ")).split())
 
 
 def _refuse_far_outside(system: pyproj.CRS, extent: Extent, label: str) -> None:
@@ -657,45 +441,3 @@ def _refuse_distorted(frame: GridFrame, extent: Extent, label: str, asked: str) 
             f"{label} is not conformal: scales differ by {anisotropy * 100:.2g} % between directions, and bearings with them; "
             "use a conformal system such as gk6"
         )
-
-
-# --- shapes and refusals -----------------------------------------------------------------------------------------------
-
-
-def _broadcast(*values: ArrayLike) -> list[FloatArray]:
-    return [np.asarray(v) for v in np.broadcast_arrays(*(np.asarray(v, dtype=np.float64) for v in values))]
-
-
-def _positions(
-    first: ArrayLike, second: ArrayLike, height: ArrayLike | None
-) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
-    a, b, h = _broadcast(first, second, np.nan if height is None else height)
-    missing = np.isnan(h)
-    return a, b, np.where(missing, 0.0, h), missing
-
-
-def _shaped(value: FloatArray, like: FloatArray) -> FloatArray:
-    return np.asarray(value, dtype=np.float64).reshape(like.shape)[()]
-
-
-def _refuse_not_finite(*values: FloatArray) -> None:
-    for value in values:
-        if not np.isfinite(value).all():
-            i = int(np.argmax(~np.isfinite(value.ravel())))
-            raise CrsError(f"grid position {i + 1} is not finite")
-
-
-def _refuse_unprojected(
-    frame: GridFrame, result: tuple[FloatArray, ...], first: FloatArray, second: FloatArray, *, geodetic: bool
-) -> None:
-    good = np.isfinite(result[0])
-    for value in result[1:]:
-        good = good & np.isfinite(value)
-    if np.all(good):
-        return
-    i = int(np.argmax(~np.atleast_1d(good).ravel()))
-    a, b = float(np.ravel(first)[i]), float(np.ravel(second)[i])
-    where = f"easting {a:g}, northing {b:g} m"
-    if geodetic:
-        where = f"latitude {math.degrees(a):g}, longitude {math.degrees(b):g} degrees"
-    raise CrsError(f"position {i + 1} ({where}) cannot be transformed in {frame.name}; remove it or use another plane")

@@ -80,15 +80,38 @@ def shortened(text: Any) -> str:
     return words if len(words) <= 80 else words[:77] + "..."
 
 
-def pin_operation(source: pyproj.CRS, target: pyproj.CRS, extent: Extent) -> tuple[str, str, float]:
-    """The best operation between two systems that has a stated accuracy and needs no grid: pipeline, name, accuracy (m)."""
+def pin_operation(
+    source: pyproj.CRS, target: pyproj.CRS, extent: Extent, *, operation: str | None = None
+) -> tuple[str, str, float]:
+    """The best operation between two systems that has a stated accuracy and needs no grid: pipeline, name, accuracy (m).
+
+    `operation` picks one by a part of its name.
+    """
+    usable, why = usable_operations(source, target, extent)
+    if operation is not None:
+        chosen = [found for found in usable if operation.strip().lower() in found[1].lower()]
+        if not chosen:
+            offered = "; ".join(f"{name} ({accuracy:g} m)" for _, name, accuracy in usable) or why
+            raise CrsError(f"no operation {shortened(operation)!r} about {extent}; PROJ offers: {offered}")
+        return min(chosen, key=lambda u: u[2])
+    if usable:
+        return min(usable, key=lambda u: u[2])  # the first of equals: PROJ knows the areas
+    raise CrsError(
+        f"no usable transformation from {_title(source)} to {_title(target)} about {extent}: {why}; {_remedy(target)}"
+    )
+
+
+def usable_operations(
+    source: pyproj.CRS, target: pyproj.CRS, extent: Extent
+) -> tuple[list[tuple[str, str, float]], str]:
+    """Every operation that may be pinned (pipeline, name, accuracy in m), and why the last of the others may not."""
     from pyproj.aoi import AreaOfInterest
     from pyproj.exceptions import ProjError
     from pyproj.transformer import TransformerGroup
 
     bound = target.is_bound or source.is_bound
 
-    def words() -> str:  # looking a system up in the registry takes 0.1 s: only to refuse
+    def words() -> str:  # looking a system up in the registry takes 0.1 s: to refuse only
         return f"{_title(source)} to {_title(target)}"
 
     # PROJ takes an area wider than the data: an operation must hold a little beyond the outermost fix
@@ -128,15 +151,11 @@ def pin_operation(source: pyproj.CRS, target: pyproj.CRS, extent: Extent) -> tup
         elif not definition.startswith("proj=") or not transformer.has_inverse:
             why = "it cannot be written down or run backwards"
         else:
-            operation = (
-                "link to WGS 84 as given with the system" if bound else _plain_operation(transformer.description)
-            )
-            usable.append((definition, operation, max(float(transformer.accuracy), 0.0)))
-    if usable:
-        return min(usable, key=lambda u: u[2])  # the first of equals: PROJ knows the areas
-    if not group.transformers and group.unavailable_operations:
+            name = "link to WGS 84 as given with the system" if bound else _plain_operation(transformer.description)
+            usable.append((definition, name, max(float(transformer.accuracy), 0.0)))
+    if not usable and not group.transformers and group.unavailable_operations:
         why = "it would need grid files"
-    raise CrsError(f"no usable transformation from {words()} about {extent}: {why}; {_remedy(target)}")
+    return usable, why
 
 
 def _title(system: pyproj.CRS) -> str:
@@ -313,7 +332,15 @@ class GeodeticFrame:
 _IDENTITY = "proj=noop"
 
 
-def geodetic_frame(name: str, latitude: ArrayLike, longitude: ArrayLike) -> GeodeticFrame:
+def geodetic_frame(
+    name: str,
+    latitude: ArrayLike,
+    longitude: ArrayLike,
+    *,
+    epoch: float | None = None,
+    fixed_to: str | None = None,
+    plate: str | None = None,
+) -> GeodeticFrame:
     """The geodetic frame of a receiver's positions, as a run names it, with its transformation to WGS 84 pinned.
 
     Parameters
@@ -323,6 +350,14 @@ def geodetic_frame(name: str, latitude: ArrayLike, longitude: ArrayLike) -> Geod
         "GSK-2011", "PZ-90.11", ...
     latitude, longitude : float or array
         Where the data lies, in that frame, rad; the operation is chosen for this area and no other.
+    epoch : float, optional
+        Decimal year of the positions; needed where the frame moves and `fixed_to` is given.
+    fixed_to : str, optional
+        The plate-fixed datum that stands for WGS 84 in the project ("ETRS89", "GSK-2011"), in which the ground does not move:
+        positions of any frame and year are carried to it, so that surveys of different years agree. Without it, positions keep
+        the epoch they were taken at.
+    plate : str, optional
+        Four letters (see `railnav.geodesy.plates`); by default the one that the data lies on beyond doubt.
 
     Returns
     -------
@@ -336,9 +371,9 @@ def geodetic_frame(name: str, latitude: ArrayLike, longitude: ArrayLike) -> Geod
 
     Notes
     -----
-    Transformations that vary with time are not applied: a frame fixed to a plate (ETRS89, GSK-2011) and WGS 84 part by
-    some 2.5 cm a year, which the stated accuracy of about 1 m contains. A survey in such a frame and a service run in it
-    agree with each other to the accuracy of the receivers.
+    A frame fixed to a plate and one fixed to the Earth part by some 2.5 cm a year: 0.37 m at Berlin from 2011 to 2026. Without
+    `fixed_to` that stays in the positions, inside the metre that such operations state; a survey and a service run of one
+    summer then still agree. With it, a chain of the table in `railnav.geodesy.datums` is run, good to some centimetres.
 
     Examples
     --------
@@ -348,9 +383,17 @@ def geodetic_frame(name: str, latitude: ArrayLike, longitude: ArrayLike) -> Geod
     from pyproj import CRS
     from pyproj.exceptions import CRSError as ProjError
 
+    from railnav.geodesy.datums import find_datum
+
     plain = "".join(c for c in name.upper() if c.isalnum())
-    if plain in {"WGS84", "EPSG4326", "EPSG4979", "OGCCRS84"} or plain.startswith("WGS84G"):
+    bare = plain in {"WGS84", "EPSG4326", "EPSG4979", "OGCCRS84"}
+    if fixed_to is not None:
+        return _carried("ITRF2020" if bare else name, fixed_to, latitude, longitude, epoch, plate)
+    if bare or plain.startswith("WGS84G"):
         return GeodeticFrame("WGS 84", _IDENTITY, "none: the frame is WGS 84", 0.0)
+    known = find_datum(name)
+    if known is not None and known.name == "PZ-90.11":  # PROJ's one way there leaves heights half a metre off
+        return _carried(name, "ITRF2008", latitude, longitude, 2010.0, plate)
     try:
         system = CRS.from_user_input(name)
     except (ProjError, TypeError, ValueError) as error:
@@ -363,3 +406,23 @@ def geodetic_frame(name: str, latitude: ArrayLike, longitude: ArrayLike) -> Geod
         )
     pipeline, operation, accuracy = pin_operation(system, CRS.from_epsg(4979), Extent.of(latitude, longitude))
     return GeodeticFrame(system.name, pipeline, operation, accuracy)
+
+
+def _carried(
+    name: str, target: str, latitude: ArrayLike, longitude: ArrayLike, epoch: float | None, plate: str | None
+) -> GeodeticFrame:
+    """A frame joined by the table of datums to the one that stands for WGS 84."""
+    from railnav.geodesy.datums import datum_shift, find_datum
+
+    shift = datum_shift(name, target, latitude, longitude, epoch=epoch, plate=plate)
+    source = find_datum(name)
+    assert source is not None
+    words = f"proj=pipeline step proj=unitconvert xy_in=deg xy_out=rad step proj=cart {source.ellipsoid} {shift.proj} "
+    pipeline = words + "step inv proj=cart ellps=WGS84 step proj=unitconvert xy_in=rad xy_out=deg"
+    at = f" at {epoch:.2f}" if source.moving and epoch is not None else ""
+    return GeodeticFrame(
+        f"{source.name}{at}",
+        " ".join(pipeline.split()),
+        f"{shift.operation}; {target} stands for WGS 84",
+        shift.accuracy,
+    )

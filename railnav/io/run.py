@@ -51,6 +51,9 @@ class _Stream(Struct):
 
 class _Gnss(_Stream):
     frame: Annotated[str, Meta(min_length=1)] = "WGS84"
+    epoch: Any = None
+    fixed_to: str = ""
+    plate: str = ""
     receiver: str = ""
     lever_arm_m: _Vector = (0.0, 0.0, 0.0)
 
@@ -139,8 +142,9 @@ def read_run(folder: str | Path, *, report: Callable[[LogSummary], None] | None 
     Notes
     -----
     GNSS coordinates in another frame than WGS 84 are turned to it by the one operation that `railnav.geodesy` pins for their
-    place; `GnssStream.frame` keeps the name of the frame they came in. An unsigned odometer that falls by more than 0.1 m is
-    refused.
+    place; `GnssStream.frame` keeps the name of the frame they came in. With `fixed_to` they are carried from their `epoch` (the
+    run's start unless given) to that plate-fixed datum, so that runs of different years agree. An unsigned odometer that
+    falls by more than 0.1 m is refused.
 
     Examples
     --------
@@ -178,7 +182,7 @@ def read_run(folder: str | Path, *, report: Callable[[LogSummary], None] | None 
         id=contents.run.id,
         start=start,
         direction=contents.run.direction,
-        gnss=_gnss(tables["gnss"], time["gnss"], contents.gnss, folder / CONTENTS) if contents.gnss else None,
+        gnss=_gnss(tables["gnss"], time["gnss"], contents.gnss, start, folder / CONTENTS) if contents.gnss else None,
         imu=_imu(tables["imu"], time["imu"], contents.imu, folder) if contents.imu else None,
         odometer=_odometer(tables["odometer"], time["odometer"], contents.odometer) if contents.odometer else None,
         gyro_angles=_gyro_angles(tables["gyro_angles"], time["gyro_angles"]) if contents.gyro_angles else None,
@@ -282,6 +286,28 @@ def _one_line(error: object) -> str:
     return text[:1].lower() + text[1:200]
 
 
+def _decimal_year(instant: datetime) -> float:
+    """Year and its part, as epochs of coordinates are counted."""
+    first = instant.replace(month=1, day=1, hour=0, minute=0, second=0, microsecond=0)
+    return instant.year + (instant - first) / (first.replace(year=instant.year + 1) - first)
+
+
+def _epoch(epoch: object, file: Path) -> float:
+    """Epoch of coordinates: a decimal year, or a date."""
+    try:
+        if isinstance(epoch, int | float) and not isinstance(epoch, bool):
+            year = float(epoch)
+        else:
+            instant = epoch if isinstance(epoch, datetime) else datetime.fromisoformat(str(epoch).strip())
+            year = _decimal_year(instant)
+    except ValueError:
+        year = float("nan")
+    if not 1980.0 <= year <= 2100.0:
+        remedy = "write a decimal year (2026.49) or a date"
+        raise RunError(f"{str(epoch)[:40]!r} is no epoch", file=file, column="gnss.epoch", remedy=remedy)
+    return year
+
+
 def _start(start: object, file: Path) -> datetime:
     example = 'write UTC, as in start = "2021-06-29T10:35:17Z"'
     try:
@@ -343,6 +369,8 @@ def _contents_text(run: Run) -> str:
         lines += ["", f"[{name}]", f'file = "{name}.csv"', 'format = "csv"']
         if isinstance(stream, GnssStream):
             lines.append('frame = "WGS84"')  # whatever they came in, in memory they are WGS 84
+            if stream.epoch is not None and not stream.fixed_to:
+                lines.append(f"epoch = {stream.epoch!r}")
             if stream.receiver:
                 lines.append(f"receiver = {_quoted(stream.receiver)}")
         if isinstance(stream, GnssStream | ImuStream):
@@ -379,16 +407,23 @@ def _fixed(values: Sequence[float]) -> FloatArray:
     return freeze(np.array(values, dtype=np.float64))
 
 
-def _gnss(table: Table, time: FloatArray, stream: _Gnss, toml: Path) -> GnssStream:
+def _gnss(table: Table, time: FloatArray, stream: _Gnss, start: datetime, toml: Path) -> GnssStream:
     latitude, longitude = np.deg2rad(table.number["latitude_deg"]), np.deg2rad(table.number["longitude_deg"])
     height = _known(table, "height_m")
-    if stream.frame != "WGS84":
+    epoch = None if stream.epoch is None else _epoch(stream.epoch, toml)
+    if stream.frame != "WGS84" or stream.fixed_to:
         from railnav.geodesy.transformation import geodetic_frame
 
         try:
-            latitude, longitude, up = geodetic_frame(stream.frame, latitude, longitude).to_wgs84(
-                latitude, longitude, height
+            frame = geodetic_frame(
+                stream.frame,
+                latitude,
+                longitude,
+                epoch=_decimal_year(start) if epoch is None else epoch,
+                fixed_to=stream.fixed_to or None,
+                plate=stream.plate or None,
             )
+            latitude, longitude, up = frame.to_wgs84(latitude, longitude, height)
         except CrsError as error:
             raise RunError(str(error), file=toml, column="gnss.frame") from error
         height = None if height is None else freeze(up)
@@ -408,6 +443,8 @@ def _gnss(table: Table, time: FloatArray, stream: _Gnss, toml: Path) -> GnssStre
         hdop=_known(table, "hdop"),
         lever_arm_b=_fixed(stream.lever_arm_m),
         frame=stream.frame,
+        epoch=epoch,
+        fixed_to=stream.fixed_to,
         receiver=stream.receiver,
     )
 

@@ -52,7 +52,6 @@ def test_missing_heights_stay_missing():
         ("nowhere", "knows no geodetic frame"),
         ("EPSG:28407", "not a frame of latitude and longitude"),
         ("EPSG:4978", "not a frame of latitude and longitude"),
-        ("PZ-90.11", "leaves heights as they are"),
     ],
 )
 def test_refusals(name, words):

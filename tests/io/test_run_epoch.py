@@ -1,0 +1,78 @@
+"""run.toml's frame and epoch: positions of any frame and year come to one datum."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from railnav.errors import RunError
+from railnav.geodesy import WGS84
+from railnav.geodesy.plates import plate_motion
+from railnav.io.run import read_run, write_run
+
+BERLIN = np.radians([52.52, 13.4])
+
+
+def write(folder, lines, *, start="2026-07-02T12:00:00Z", place=BERLIN):
+    folder.mkdir()
+    (folder / "run.toml").write_text(f'[run]\nid = "r"\nstart = "{start}"\n\n[gnss]\nfile = "gnss.csv"\n{lines}\n')
+    latitude, longitude = np.degrees(place).tolist()
+    rows = [f"{t},{latitude!r},{longitude + t * 1e-5!r},80.0" for t in range(3)]
+    (folder / "gnss.csv").write_text("time_s,latitude_deg,longitude_deg,height_m\n" + "\n".join(rows) + "\n")
+    return folder
+
+
+def cartesian(run):
+    gnss = run.gnss
+    return np.column_stack(WGS84.to_cartesian(gnss.latitude, gnss.longitude, gnss.height))
+
+
+def test_the_start_is_the_epoch_unless_one_is_given(tmp_path):
+    plain = read_run(write(tmp_path / "a", ""))
+    moved = read_run(write(tmp_path / "b", 'frame = "ITRF2020"\nfixed_to = "ETRS89"'))
+    given = read_run(write(tmp_path / "c", 'frame = "ITRF2020"\nfixed_to = "ETRS89"\nepoch = 2026.5'))
+    dated = read_run(write(tmp_path / "d", 'frame = "WGS84"\nfixed_to = "ETRS89"\nepoch = "2026-07-02"'))
+    shift = np.linalg.norm(cartesian(moved) - cartesian(plain), axis=1)
+    np.testing.assert_allclose(shift, 0.95, atol=0.03)  # spec 1.5, 6: ITRF2020 at 2026 to ETRF, Berlin
+    np.testing.assert_allclose(cartesian(moved), cartesian(given), atol=2e-4)
+    np.testing.assert_allclose(cartesian(moved), cartesian(dated), atol=2e-4)
+    assert (given.gnss.epoch, given.gnss.fixed_to, plain.gnss.epoch) == (2026.5, "ETRS89", None)
+
+
+def test_two_years_of_one_place_agree(tmp_path):
+    x = np.stack(WGS84.to_cartesian(*BERLIN, 80.0))
+    later = np.array(WGS84.to_geodetic(*plate_motion("EURA", 10.0).apply(x)))
+    first = read_run(write(tmp_path / "a", 'frame = "ITRF2014"\nepoch = 2016.0\nfixed_to = "ETRS89"'))
+    second = read_run(write(tmp_path / "b", 'frame = "ITRF2014"\nepoch = 2026.0\nfixed_to = "ETRS89"', place=later[:2]))
+    parted = np.linalg.norm(cartesian(second) - cartesian(first), axis=1)
+    assert (
+        parted.max() < 0.02
+    )  # 0.25 m untreated; what is left is ETRF2000's own rotation, 0.6 mm a year from the plate's
+    assert float(np.linalg.norm(plate_motion("EURA", 10.0).apply(x) - x)) > 0.2
+
+
+def test_written_runs_read_back(tmp_path):
+    for name, lines in {
+        "a": 'frame = "PZ-90.11"\nepoch = 2020.25',
+        "b": 'frame = "ITRF2020"\nfixed_to = "ETRS89"',
+    }.items():
+        run = read_run(write(tmp_path / name, lines))
+        write_run(run, tmp_path / f"{name}-again")
+        again = read_run(tmp_path / f"{name}-again")
+        np.testing.assert_allclose(cartesian(again), cartesian(run), atol=2e-3)
+        assert again.gnss.epoch == (2020.25 if name == "a" else None)
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        ('epoch = "yesterday"', "is no epoch"),
+        ("epoch = 20260702", "is no epoch"),
+        ("epoch = true", "is no epoch"),
+        ('fixed_to = "Tokyo"', "no datum 'Tokyo'"),
+        ('frame = "ITRF2020"\nfixed_to = "GSK-2011"\nplate = "EURO"', "no plate"),
+    ],
+)
+def test_refusals(tmp_path, lines, words):
+    with pytest.raises(RunError, match=words):
+        read_run(write(tmp_path / "a", lines))
