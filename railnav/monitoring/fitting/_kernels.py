@@ -208,3 +208,160 @@ def segment(
         out[k, 2] = tree[node, 3]
         node = tree[node, 0]
     return out, cost[c]
+
+
+@njit(cache=True)
+def _shape(kind, t):  # kind of railnav.track.elements, share of the length -> f, integral of f, t f
+    """Law of a transition and its integral, eq (2)."""
+    if kind == 2:
+        return t, 0.5 * t * t
+    if kind == 3:
+        return t * t * (3.0 - 2.0 * t), t**3 - 0.5 * t**4
+    if kind == 4:
+        return 0.5 * (1.0 - math.cos(math.pi * t)), 0.5 * t - math.sin(math.pi * t) / (2.0 * math.pi)
+    if kind == 5:
+        w = 2.0 * math.pi * t
+        return t - math.sin(w) / (2.0 * math.pi), 0.5 * t * t + (math.cos(w) - 1.0) / (4.0 * math.pi**2)
+    if kind == 6:
+        if t < 0.5:
+            return 2.0 * t * t, 2.0 * t**3 / 3.0
+        return -1.0 + 4.0 * t - 2.0 * t * t, 1.0 / 6.0 - t + 2.0 * t * t - 2.0 * t**3 / 3.0
+    if kind == 7:
+        return (
+            t**4 * (35.0 - 84.0 * t + 70.0 * t * t - 20.0 * t**3),
+            t**5 * (7.0 - 14.0 * t + 10.0 * t * t - 2.5 * t**3),
+        )
+    return 0.0, 0.0
+
+
+@njit(cache=True)
+def _run(p, v):  # slope at the end of a cubic parabola, share of its abscissa -> length over abscissa of the end
+    """Length of y = x^3 / (6 c) up to v x_e: integral of sqrt(1 + p^2 w^4), by its series."""
+    q = (p * v * v) ** 2
+    return v * (1.0 + q / 10.0 - q * q / 72.0 + q**3 / 208.0 - 5.0 * q**4 / 2176.0 + 7.0 * q**5 / 5376.0)
+
+
+@njit(cache=True)
+def _cubic_slope(turn):  # |k| L -> slope p at the end
+    """Solve k L = 2 p (1 + p^2)^(-3/2) G(p) for p by fixed-point steps."""
+    p = 0.5 * turn
+    for _ in range(40):
+        p = 0.5 * turn * (1.0 + p * p) ** 1.5 / _run(p, 1.0)
+        if p > 0.7:
+            p = 0.7
+    return p
+
+
+@njit(cache=True)
+def _bearing(kind, s, length, k0, k1, sway, p, out):  # -> turn, curvature, d turn / d (k0, k1, length) in out (5,)
+    """Turn and curvature s metres into an element, and how the turn depends on its parameters, eqs (1), (2), (9)."""
+    t = s / length
+    if kind < 2:
+        out[0] = k0 * s
+        out[1] = k0
+        out[2] = s
+        out[3] = 0.0
+        out[4] = 0.0
+        return
+    shape = kind if kind < 8 else 2
+    f, whole = _shape(shape, t)
+    out[0] = k0 * s + (k1 - k0) * length * whole
+    out[1] = k0 + (k1 - k0) * f
+    out[2] = s - length * whole
+    out[3] = length * whole
+    out[4] = (k1 - k0) * (whole - t * f)
+    if kind == 7:
+        rest = t * (1.0 - t)
+        out[0] -= sway * length * 140.0 * rest**3
+        out[1] -= sway * 420.0 * rest * rest * (1.0 - 2.0 * t)
+    elif kind == 8:
+        forward = k0 == 0.0
+        k = k1 if forward else k0
+        u = t if forward else 1.0 - t
+        whole_run = _run(p, 1.0)
+        v = u
+        for _ in range(5):
+            v -= (_run(p, v) - u * whole_run) / math.sqrt(1.0 + (p * v * v) ** 2)
+        slope = p * v * v
+        side = 1.0 if k > 0.0 else -1.0
+        out[0] = side * (math.atan(slope) if forward else math.atan(p) - math.atan(slope))
+        out[1] = side * 2.0 * p * v / (length / whole_run) * (1.0 + slope * slope) ** -1.5
+
+
+@njit(cache=True)
+def lay(kind, length, k0, k1, sway, east, north, bearing, owner, s, here, slopes, ends, end_slopes):
+    """Points of elements and their derivatives by Gauss-Legendre, eqs (1), (9).
+
+    Elements (m,), each from its own start; points sorted by (owner, s), (n,). Fills `here` (n, 4): easting, northing, bearing,
+    curvature; `slopes` (n, 8): d(easting, northing) by k0, k1, length, and easting and northing from the element's start; and the
+    same at the ends of elements with d(bearing) by k0, k1 and length in three more columns, (m, 4) and (m, 11).
+    """
+    n, m = len(s), len(length)
+    out = np.empty(5)
+    i = 0
+    for j in range(m):
+        p = 0.0
+        if kind[j] == 8:
+            p = _cubic_slope(max(abs(k0[j]), abs(k1[j])) * length[j])
+        at = 0.0
+        sums = np.zeros(8)
+        done = False
+        longest = 2.0
+        sharp = max(abs(k0[j]), abs(k1[j]))
+        if sharp > 0.0 and 0.2 / sharp < longest:
+            longest = 0.2 / sharp
+        while not done:
+            if i < n and owner[i] == j:
+                target = s[i]
+            else:
+                target = length[j]
+                done = True
+            width = target - at
+            pieces = int(math.ceil(abs(width) / longest - 1e-9))
+            if pieces < 1:
+                pieces = 1
+            h = width / pieces
+            for q in range(pieces):
+                for g in range(4):
+                    _bearing(kind[j], at + h * (q + _X[g]), length[j], k0[j], k1[j], sway[j], p, out)
+                    b = bearing[j] + out[0]
+                    sb, cb = math.sin(b), math.cos(b)
+                    w = h * _W[g]
+                    sums[6] += w * sb
+                    sums[7] += w * cb
+                    for c in range(3):
+                        sums[2 * c] += w * cb * out[2 + c]
+                        sums[2 * c + 1] -= w * sb * out[2 + c]
+            at = target
+            _bearing(kind[j], at, length[j], k0[j], k1[j], sway[j], p, out)
+            if done:
+                ends[j, 0] = east[j] + sums[6]
+                ends[j, 1] = north[j] + sums[7]
+                ends[j, 2] = bearing[j] + out[0]
+                ends[j, 3] = out[1]
+                for c in range(8):
+                    end_slopes[j, c] = sums[c]
+                for c in range(3):
+                    end_slopes[j, 8 + c] = out[2 + c]
+            else:
+                here[i, 0] = east[j] + sums[6]
+                here[i, 1] = north[j] + sums[7]
+                here[i, 2] = bearing[j] + out[0]
+                here[i, 3] = out[1]
+                for c in range(8):
+                    slopes[i, c] = sums[c]
+                i += 1
+
+
+@njit(cache=True)
+def advance(owner, s, length, step):  # (n,) element and place in it, (m,) lengths, (n,) steps: owner and s changed in place
+    """Move feet along the elements; the first and last element go on straight past their ends."""
+    last = len(length) - 1
+    for i in range(len(s)):
+        s[i] += step[i]
+        while s[i] < 0.0 and owner[i] > 0:
+            owner[i] -= 1
+            s[i] += length[owner[i]]
+        while s[i] > length[owner[i]] and owner[i] < last:
+            s[i] -= length[owner[i]]
+            owner[i] += 1
