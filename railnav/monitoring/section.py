@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -304,7 +305,7 @@ def _visits(solution: Solution) -> list[tuple[int, int, int, int]]:
     track = np.where(np.isfinite(solution.offset) & (solution.sigma_along < USELESS_SIGMA), solution.track, -1)
     edges = np.flatnonzero(np.diff(track, prepend=-2, append=-2))
     visits: list[tuple[int, int, int, int]] = []
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in pairwise(edges.tolist()):
         if track[a] < 0:
             continue
         motion = np.sign(solution.running_direction[a:b] * np.nan_to_num(solution.speed[a:b]))

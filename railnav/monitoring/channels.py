@@ -1,0 +1,360 @@
+"""Track geometry channels: longitudinal level, alignment, cross level, gauge, twist, curvature, each with what it can bear.
+
+Names and signs: longitudinal level is the height of the track above its smoothed course, positive upwards; alignment its distance to the
+right; cross level positive with the left rail high; twist the growth of cross level over a base; gauge as measured. All as
+distance along the section grows. Metres and radians.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from railnav.errors import TrackError
+from railnav.monitoring.filters import (
+    D1,
+    D2,
+    D3_ALIGNMENT,
+    D3_LEVEL,
+    Band,
+    band_noise,
+    band_pass,
+    low_pass,
+)
+from railnav.monitoring.recording import Recording, Series
+from railnav.monitoring.versines import Chord
+
+FloatArray = NDArray[np.float64]
+
+#: Twist bases used by default, m.
+TWIST_BASES = (3.0, 9.0)
+#: Samples farther apart than this do not meet EN 13848-1, m.
+FINEST_REQUIRED = 0.5
+#: Shortest wavelength that is asked of GNSS positions, m.
+SHORTEST_GNSS = 200.0
+#: A displacement's wavelength needs this many samples.
+SAMPLES_A_WAVE = 3.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Channel:
+    """One channel on the grid of a section.
+
+    Attributes
+    ----------
+    key : str
+        e.g. "longitudinal_level_d1", "twist_3m", "gauge".
+    title : str
+        In words.
+    unit : str
+        SI unit of the values: "m", "m/m" or "1/m".
+    values : (n,) array
+        NaN where there is no answer.
+    sigma : float
+        Standard deviation of a value by the white noise of the samples, at most; NaN unknown.
+    source : str
+        The stream, in words.
+    band : Band or None
+    spacing : float
+        Distance between raw samples, m.
+    """
+
+    key: str
+    title: str
+    unit: str
+    values: FloatArray
+    sigma: float
+    source: str
+    band: Band | None = None
+    spacing: float = math.nan
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Geometry:
+    """The channels of one run on one section.
+
+    Attributes
+    ----------
+    recording : Recording
+    channels : dict of str to Channel
+    refused : dict of str to str
+        Channels that the run cannot give, and why.
+    distance : (n,) array
+        Along the section, m; for an overlaid run the corrected one.
+    """
+
+    recording: Recording
+    channels: dict[str, Channel]
+    refused: dict[str, str]
+
+    @property
+    def distance(self) -> FloatArray:
+        """Grid along the section, m."""
+        return self.recording.distance
+
+
+def twist(cross_level: ArrayLike, step: float, base: float) -> FloatArray:
+    """Twist: growth of cross level over a base, centred, as a gradient.
+
+    t(s) = [c(s + l/2) - c(s - l/2)] / l: no shift along the track. A linear cant ramp of 1 in n shows as 1/n.
+
+    Parameters
+    ----------
+    cross_level : (n,) array
+        m.
+    step, base : float
+        m; between samples linear.
+
+    Returns
+    -------
+    (n,) array
+        m/m; NaN where the base reaches beyond the ends.
+
+    References
+    ----------
+    docs/theory/geometry.md (8).
+
+    Examples
+    --------
+    >>> twist(np.arange(0.0, 0.021, 0.001), 1.0, 3.0)[10].round(6)
+    np.float64(0.001)
+    """
+    c = np.asarray(cross_level, float)
+    if not 0.0 < base <= step * len(c) or base < 2.0 * step:
+        raise TrackError(f"a twist base of {base} m does not fit a channel of {len(c)} samples at {step} m")
+    half = 0.5 * base / step
+    index = np.arange(len(c), dtype=float)
+    ahead, behind = (_between(c, index + half), _between(c, index - half))
+    return np.asarray((ahead - behind) / base)
+
+
+def _between(values: FloatArray, index: FloatArray) -> FloatArray:
+    low = np.floor(index).astype(np.int64)
+    share = index - low
+    inside = (low >= 0) & (low + (share > 1e-9) < len(values))
+    i = np.clip(low, 0, len(values) - 1)
+    j = np.clip(low + 1, 0, len(values) - 1)
+    out = np.where(share > 1e-9, (1.0 - share) * values[i] + share * values[j], values[i])
+    return np.where(inside, out, np.nan)
+
+
+def twist_gain(wavelength: ArrayLike, base: float) -> FloatArray:
+    """Growth over the base that a wave of cross level of unit amplitude shows, |2 sin(pi l / L)|: 0 where the base holds whole waves."""
+    return np.abs(2.0 * np.sin(np.pi * base / np.asarray(wavelength, float)))
+
+
+def channels_of(recording: Recording, *, bases: Sequence[float] = TWIST_BASES) -> Geometry:
+    """Work out every channel that a run's streams support, and say why not for the others.
+
+    Parameters
+    ----------
+    recording : Recording
+    bases : sequence of float
+        Twist bases, m.
+
+    Returns
+    -------
+    Geometry
+        A band is refused where samples lie too far apart for its shortest wave (three samples a wave).
+
+    Notes
+    -----
+    100 km at 0.25 m take about 2 s.
+    """
+    step, series = recording.step, recording.series
+    channels: dict[str, Channel] = {}
+    refused: dict[str, str] = {}
+
+    def add(
+        key: str, title: str, unit: str, values: FloatArray, sigma: float, of: Series, band: Band | None = None
+    ) -> None:
+        channels[key] = Channel(key, title, unit, values, sigma, of.source, band, of.spacing)
+
+    if "gauge" in series:
+        gauge = series["gauge"]
+        add("gauge", "Gauge", "m", gauge.values, gauge.noise, gauge)
+    else:
+        refused["gauge"] = "the run has no gauge stream"
+    _cross_level(recording, bases, channels, refused)
+    _bands(recording, channels, refused)
+    if "curvature_full" in series:
+        curve = series["curvature_full"]
+        smooth = low_pass(curve.values, step, 25.0)
+        add(
+            "curvature",
+            "Curvature, waves over 25 m",
+            "1/m",
+            smooth,
+            curve.noise * math.sqrt(2.0 * curve.spacing / 25.0),
+            curve,
+        )
+    elif "bearing" in series and series["bearing"].spacing <= 25.0:
+        bearing = series["bearing"]
+        values = low_pass(bearing.values, step, 25.0)
+        curvature = np.gradient(values, step)
+        if recording.against_model:
+            curvature = curvature + recording.passage.section.at(recording.distance).curvature
+        noise = bearing.noise * math.sqrt(2.0 * bearing.spacing / 25.0) * 2.0 * math.pi / 25.0
+        add("curvature", "Curvature, waves over 25 m", "1/m", curvature, noise, bearing)
+    else:
+        refused["curvature"] = "the run has neither an IMU nor gyro angles, or samples them more than 25 m apart"
+    _gnss(recording, channels, refused)
+    return Geometry(recording, channels, refused)
+
+
+def _cross_level(
+    recording: Recording, bases: Sequence[float], channels: dict[str, Channel], refused: dict[str, str]
+) -> None:
+    if "cross_level" not in recording.series:
+        for key in ("cross_level", *(twist_key(base) for base in bases)):
+            refused[key] = "the run has neither cant in a gauge stream nor gyro angles"
+        return
+    of = recording.series["cross_level"]
+    channels["cross_level"] = Channel(
+        "cross_level", "Cross level", "m", of.values, of.noise, of.source, None, of.spacing
+    )
+    if recording.against_model:
+        cant = recording.passage.section.at(recording.distance).cant
+        channels["cross_level_deviation"] = Channel(
+            "cross_level_deviation",
+            "Cross level minus the model's cant",
+            "m",
+            of.values - cant,
+            of.noise,
+            of.source,
+            None,
+            of.spacing,
+        )
+    for base in bases:
+        key = twist_key(base)
+        if not of.spacing <= base / 2.0:
+            refused[key] = (
+                f"cross level was sampled each {of.spacing:.1f} m; a base of {base:g} m takes {base / 2.0:g} m"
+            )
+        elif base > recording.distance[-1] or base < 2.0 * recording.step:
+            refused[key] = f"a base of {base:g} m does not fit the section at steps of {recording.step:g} m"
+        else:
+            values = twist(of.values, recording.step, base)
+            sigma = math.sqrt(2.0) * of.noise / base
+            channels[key] = Channel(key, f"Twist on {base:g} m", "m/m", values, sigma, of.source, None, of.spacing)
+
+
+def twist_key(base: float) -> str:
+    """Key of the twist channel on a base, m: twist_3m, twist_2.5m."""
+    return f"twist_{base:g}m"
+
+
+#: The banded channels: key, title, series in the order preferred with how often to integrate and the sign, bands.
+_BANDED: tuple[tuple[str, str, tuple[tuple[str, int], ...], tuple[Band, ...]], ...] = (
+    ("longitudinal_level", "Longitudinal level", (("slope", 1), ("pitch_rate", 2)), (D1, D2, D3_LEVEL)),
+    ("alignment", "Alignment", (("bearing", 1), ("curvature", 2)), (D1, D2, D3_ALIGNMENT)),
+)
+
+
+def _bands(recording: Recording, channels: dict[str, Channel], refused: dict[str, str]) -> None:
+    """Longitudinal level and alignment in D1, D2, D3, each from the first series that is fine enough."""
+    for name, title, sources, bands in _BANDED:
+        present = [(recording.series[key], times) for key, times in sources if key in recording.series]
+        for band in bands:
+            key = f"{name}_{band.name.lower()}"
+            fine = [(of, times) for of, times in present if of.spacing <= band.lower / SAMPLES_A_WAVE]
+            if not present:
+                refused[key] = "the run has neither gyro angles nor an IMU"
+                continue
+            if not fine:
+                best = min(of.spacing for of, _ in present)
+                refused[key] = (
+                    f"sampled each {best:.1f} m; {band.name} begins at waves of {band.lower:g} m and takes {band.lower / SAMPLES_A_WAVE:.1f} m"
+                )
+                continue
+            of, times = min(fine, key=lambda pair: band_noise(pair[0].noise, pair[0].spacing, band, integrate=pair[1]))
+            values = band_pass(of.values, recording.step, band, integrate=times)
+            if not np.isfinite(values).any():
+                refused[key] = f"no stretch without a gap is longer than {2 * band.settling:g} m"
+                continue
+            white = band_noise(of.noise, of.spacing, band, integrate=times)
+            channels[key] = Channel(
+                key,
+                f"{title} {band.name}",
+                "m",
+                values,
+                math.hypot(white, _misplaced(recording, name, band)),
+                of.source,
+                band,
+                of.spacing,
+            )
+
+
+def _misplaced(recording: Recording, name: str, band: Band) -> float:
+    """What an error of place along the track leaves in a band when the model's shape is taken off: its bearing there, times the error."""
+    if not recording.against_model:
+        return 0.0
+    point = recording.passage.section.at(recording.distance)
+    bend = point.curvature if name == "alignment" else np.gradient(np.arctan(point.gradient), recording.step)
+    shape = band_pass(np.where(np.isfinite(bend), bend, 0.0), recording.step, band, integrate=1)
+    known = shape[np.isfinite(shape)]
+    return float(np.sqrt(np.mean(known**2))) * recording.passage.sigma if len(known) else 0.0
+
+
+def _gnss(recording: Recording, channels: dict[str, Channel], refused: dict[str, str]) -> None:
+    """Long-wave deviations from the model: what GNSS positions alone can say."""
+    for key, title, name in (
+        ("plan_deviation", "Distance from the model to the right", "plan_gnss"),
+        ("height_deviation", "Height above the model", "height_gnss"),
+    ):
+        of = recording.series.get(name)
+        if of is None:
+            refused[key] = (
+                "no GNSS positions on the section"
+                if name == "plan_gnss"
+                else "no GNSS heights, or a model without heights"
+            )
+            continue
+        shortest = max(SHORTEST_GNSS, 10.0 * of.spacing)
+        values = low_pass(of.values, recording.step, shortest)
+        # slow receiver errors do not average out over a wave: the scatter of the smoothed deviation itself bounds what it can show
+        known = values[np.isfinite(values)]
+        scatter = float(1.4826 * np.median(np.abs(known - np.median(known)))) if len(known) else math.nan
+        white = of.noise * math.sqrt(2.0 * of.spacing / shortest)
+        channels[key] = Channel(
+            key,
+            f"{title}, waves over {shortest:.0f} m",
+            "m",
+            values,
+            max(scatter, white),
+            of.source,
+            None,
+            of.spacing,
+        )
+
+
+def versine_channel(geometry: Geometry, chord: Chord, name: str = "alignment") -> FloatArray:
+    """Versines that a chord would show of alignment (or longitudinal level) in D1 to D3, worked out from the inertial channels.
+
+    Parameters
+    ----------
+    geometry : Geometry
+    chord : Chord
+        Arms that are whole numbers of steps.
+    name : str
+        "alignment" or "longitudinal_level".
+
+    Returns
+    -------
+    (n,) array
+        m; of the deviations alone, the design's own versines not included.
+    """
+    from railnav.monitoring.versines import versines
+
+    parts = [
+        geometry.channels[f"{name}_{band}"].values
+        for band in ("d1", "d2", "d3")
+        if f"{name}_{band}" in geometry.channels
+    ]
+    if not parts:
+        raise TrackError(f"the run gives no {name} channel to take versines of")
+    return versines(np.sum(parts, axis=0), geometry.recording.step, chord)
