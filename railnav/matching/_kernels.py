@@ -41,9 +41,23 @@ POINT_SIZE = 9
 #: Integer marks of a hypothesis.
 COUNT, CURRENT, RECORD, VERSION, MOVED, SIGN = range(6)
 TAGS = 6
-#: Real-valued marks of a hypothesis: time the slip began (-inf: none), time since when the wheel agrees again, evidence that fades.
-SLIP_SINCE, AGREE_SINCE, FADING = range(3)
-INFO = 3
+#: Real-valued marks of a hypothesis: time the slip began (-inf: none), time since when the wheel agrees again, evidence that fades, and
+#: how much of it is believed; then its ledger, what each kind of evidence has added to its log-weight.
+SLIP_SINCE, AGREE_SINCE, FADING, BELIEVED = range(4)
+LEDGER = 4
+(
+    BY_PATH,  # prior of the start and of each turnout's legs, the end of the line
+    BY_POSITION,
+    BY_SPEED,
+    BY_COURSE,
+    BY_ODOMETER,
+    BY_YAW,
+    BY_SIDE,
+    BY_BALISE,
+    BY_STANDSTILL,
+) = range(LEDGER, LEDGER + 9)
+ENTRIES = 9
+INFO = LEDGER + ENTRIES
 #: A train moves one way or the other beyond this speed, m/s.
 MOVING = 0.2
 
@@ -210,6 +224,13 @@ def clone(bank, h):
 
 
 @part
+def credit(bank, h, entry, nats):
+    """Add evidence to a hypothesis' log-weight, and write it in its ledger."""
+    bank.logw[h] += nats
+    bank.info[h, entry] += nats
+
+
+@part
 def leaving_end(track, way):
     """Track end by which a train that runs this way leaves."""
     return 2 * track + (1 if way > 0 else 0)
@@ -288,7 +309,7 @@ def follow(
             if s > far:
                 ends = 1
             break
-        bank.logw[h] -= math.log(k1 - k0)
+        credit(bank, h, BY_PATH, -math.log(k1 - k0))
         for k in range(k0 + 1, k1):
             append(net, bank, clone(bank, h), net.move_to[k])
         append(net, bank, h, net.move_to[k0])
@@ -304,7 +325,7 @@ def follow(
             break
         if k1 - k0 > 1 and not speed < -MOVING:
             break
-        bank.logw[h] -= math.log(k1 - k0)
+        credit(bank, h, BY_PATH, -math.log(k1 - k0))
         for k in range(k0 + 1, k1):
             prepend(net, bank, clone(bank, h), net.move_to[k])
         prepend(net, bank, h, net.move_to[k0])
@@ -332,7 +353,7 @@ def _rearm(net, bank, h, s, speed, margin):
         elif armed[h, i] == 1 and ahead and speed > MOVING and gap < margin:
             armed[h, i] = 0
             kept = entering_end(track[h, i + 1], way[h, i + 1])
-            bank.logw[h] -= math.log(k1 - k0)
+            credit(bank, h, BY_PATH, -math.log(k1 - k0))
             for k in range(k0, k1):
                 if net.move_to[k] != kept:
                     g = clone(bank, h)
@@ -342,7 +363,7 @@ def _rearm(net, bank, h, s, speed, margin):
         elif armed[h, i] == 1 and not ahead and speed < -MOVING and -gap < margin:
             armed[h, i] = 0
             kept = leaving_end(track[h, i], way[h, i])
-            bank.logw[h] -= math.log(k1 - k0)
+            credit(bank, h, BY_PATH, -math.log(k1 - k0))
             for k in range(k0, k1):
                 if net.move_to[k] != kept:
                     g = clone(bank, h)
@@ -438,6 +459,8 @@ def merge(bank, a, b, offset, position, column):  # slots; m; state index; scrat
     bank.logw[a] = top + math.log(total)
     wa /= total
     wb /= total
+    for i in range(LEDGER, INFO):
+        bank.info[a, i] = wa * bank.info[a, i] + wb * bank.info[b, i]
     bank.x[b, position] += offset
     root_a = math.sqrt(wa)
     P = bank.P_sqrt[a]

@@ -15,20 +15,25 @@ from numba import njit
 from railnav import units
 from railnav.matching import _kernels as paths
 from railnav.matching._kernels import (
+    BELIEVED,
+    BY_ODOMETER,
+    BY_PATH,
+    BY_POSITION,
     COUNT,
     CURRENT,
     FADING,
     MOVED,
+    P_CURVATURE,
     P_D_EAST,
     P_D_NORTH,
     P_EAST,
     P_GRADIENT,
     P_NORTH,
+    P_SIGMA_CROSS,
     POINT_SIZE,
     RECORD,
-    SIGN,
     VERSION,
-    clone,
+    credit,
     drop,
     drop_all,
     entering_end,
@@ -43,24 +48,18 @@ from railnav.matching._kernels import (
 )
 from railnav.navigation import columns, state
 from railnav.navigation.columns import (
-    ACCELERATION,
     ACCELEROMETER_BIAS,
-    AMBIGUOUS,
+    BLIND_LENGTH,
     C_DISTRUST,
     C_FIX_TIME,
     C_FIXES,
-    C_FORCE_REST,
     C_FRAME_SIGMA,
     C_FRAME_TIME,
     C_FRESH,
     C_GNSS_SPEED,
-    C_GNSS_SPEED_TIME,
-    C_GNSS_STILL,
     C_JUMPS,
     C_NOTHING_NEAR,
-    C_OUT_TRACK,
-    C_OUT_WAY,
-    C_REVISIONS,
+    C_OUT_MODE,
     C_RING,
     C_RIVAL_TIME,
     C_SCALE,
@@ -68,9 +67,7 @@ from railnav.navigation.columns import (
     C_SCALE_WEIGHT,
     C_SIGMA_EAST,
     C_SIGMA_NORTH,
-    C_SPEED_STALE,
     C_START_TIME,
-    C_STARTED,
     C_STEPS,
     C_STOOD,
     C_SUSPECT_FIXES,
@@ -78,20 +75,13 @@ from railnav.navigation.columns import (
     C_SUSPECTS,
     C_TIME,
     C_TRY,
-    C_WHEEL_MOVED,
-    C_WHEEL_SEEN,
-    COASTING,
-    DIRECTION_CONFIDENCE,
     DISTANCE,
     DISTRUST,
     DONE,
+    DOUBTED,
     EAST,
     FORCE,
     GNSS_EAST,
-    GNSS_SPEED,
-    INITIALISING,
-    K_COASTING,
-    K_CONFIDENCE,
     K_CORRELATED,
     K_FRAME,
     K_FRAME_LEAST,
@@ -101,11 +91,13 @@ from railnav.navigation.columns import (
     K_GRAVITY,
     K_LOST_AFTER,
     K_LOST_SIGMA,
+    K_MAP_LENGTH,
     K_MEMORY,
     K_MERGE,
     K_MODEL,
     K_MOST,
     K_ODOMETER_SIGMA,
+    K_POSITION_DOUBT,
     K_PRUNE,
     K_REVERSE,
     K_SCALE_LEAST,
@@ -113,30 +105,13 @@ from railnav.navigation.columns import (
     K_SCALE_PRIOR,
     K_SCALE_START,
     K_STEP_FIXES,
-    K_STILL_TIME,
     K_TAG_MOST,
     K_USABLE,
-    KICK,
-    LEAVING,
-    LOST,
+    MAP_CROSS,
     NEEDS_RIVALS,
     NEEDS_ROOM,
     NEEDS_START,
-    OFF_MODEL,
-    OUT_ACCELERATION,
-    OUT_DIRECTION,
-    OUT_FIX_AGE,
-    OUT_HYPOTHESES,
-    OUT_LEVEL,
     OUT_MODE,
-    OUT_OFFSET,
-    OUT_PROBABILITY,
-    OUT_SIGMA,
-    OUT_SIGMA_SPEED,
-    OUT_SPEED,
-    OUT_TRACK,
-    OUT_WAY,
-    OUTPUT_SIZE,
     POSITION,
     PULLS,
     R_EPOCH,
@@ -146,7 +121,6 @@ from railnav.navigation.columns import (
     R_VERSION,
     RING,
     RIVAL_INTERVAL,
-    S_MASS,
     S_NIS,
     S_PULL,
     S_SAID,
@@ -154,17 +128,17 @@ from railnav.navigation.columns import (
     S_SIGN,
     S_SLIP,
     S_STEP,
+    S_STRETCH,
     S_TAG,
+    S_TRAVEL,
     SIGMA_EAST,
     SIGMA_NORTH,
-    SIGMA_SPEED,
     SPEED,
     SPEED_LATENCY,
     START_GATE,
     START_PROBATION,
     TIME,
     TIME_TAG,
-    TRACKING,
     W_BEFORE,
     W_COLUMN,
     W_F,
@@ -173,8 +147,9 @@ from railnav.navigation.columns import (
     W_MOVE,
     W_NEW,
     WHEEL_DISTANCE,
-    WHEEL_SPEED,
 )
+from railnav.navigation.decision import _kernels as decision
+from railnav.navigation.decision._kernels import keep_journal, put_out
 from railnav.navigation.dynamics import _kernels as dynamics
 from railnav.navigation.dynamics._kernels import (
     absorb,
@@ -187,126 +162,12 @@ from railnav.navigation.dynamics._kernels import (
     widen,
 )
 from railnav.navigation.integrity import _kernels as integrity
-from railnav.navigation.integrity._kernels import mixture_bound
 from railnav.navigation.measurements import _kernels as measurements
 from railnav.navigation.measurements._kernels import direction, gravity_pull, motion_rows, position_row, wheel_row
+from railnav.navigation.standing import _kernels as standing
+from railnav.navigation.standing._kernels import depart, kick, remember, stands, watch
 
 # ---------------------------------------------------------------- what all hypotheses share
-
-
-@part
-def watch(fil, shared, row):
-    """Watch the receiver and the wheel: smoothed sigmas, repeated speeds, since when each is at rest."""
-    common = shared.common
-    time = row[TIME]
-    if row[EAST] == row[EAST] and row[SIGMA_EAST] <= fil.settings[K_USABLE]:
-        share = 1.0
-        if common[C_SIGMA_EAST] > 0.0:
-            share = 1.0 - math.exp(-max(time - common[C_FIX_TIME], 0.0) / 5.0)
-        common[C_SIGMA_EAST] += share * (row[SIGMA_EAST] - common[C_SIGMA_EAST])
-        common[C_SIGMA_NORTH] += share * (row[SIGMA_NORTH] - common[C_SIGMA_NORTH])
-    common[C_SPEED_STALE] = 0.0
-    speed = row[GNSS_SPEED]
-    if speed == speed:
-        if speed == common[C_GNSS_SPEED] and (speed > 0.01 or time < common[C_DISTRUST]):
-            common[C_SPEED_STALE] = 1.0
-        common[C_GNSS_SPEED] = speed
-        common[C_GNSS_SPEED_TIME] = time
-        resting = 0.3
-        if row[SIGMA_SPEED] > 0.1:
-            resting = min(3.0 * row[SIGMA_SPEED], 0.6)
-        if speed > resting:
-            common[C_GNSS_STILL] = np.inf
-        elif common[C_GNSS_STILL] == np.inf:
-            common[C_GNSS_STILL] = time
-    if row[DISTANCE] == row[DISTANCE]:
-        if row[DISTANCE] != shared.ring[(int(common[C_RING]) - 1) % RING, 1]:
-            common[C_WHEEL_MOVED] = time
-        common[C_WHEEL_SEEN] = time
-    elif row[WHEEL_SPEED] == row[WHEEL_SPEED]:
-        if abs(row[WHEEL_SPEED]) > 0.05:
-            common[C_WHEEL_MOVED] = time
-        common[C_WHEEL_SEEN] = time
-
-
-@part
-def remember(shared, row):
-    """Keep the latest odometer reading."""
-    if row[DISTANCE] == row[DISTANCE]:
-        r = int(shared.common[C_RING])
-        shared.ring[r, 0] = row[TIME]
-        shared.ring[r, 1] = row[DISTANCE]
-        shared.common[C_RING] = (r + 1) % RING
-
-
-@part
-def heaviest(bank):
-    """Slot of the hypothesis with the greatest weight."""
-    best = bank.live[1]
-    for i in range(1, bank.live[0]):
-        if bank.logw[bank.live[1 + i]] > bank.logw[best]:
-            best = bank.live[1 + i]
-    return best
-
-
-@part
-def stands(fil, shared, bank, row):
-    """Whether the train is found to stand: wheels at rest and no GNSS speed against it; without wheels, GNSS speed at rest.
-
-    A train at rest leaves when its specific force changes: a slow GNSS must not make an accelerometer bias of it.
-    """
-    time = row[TIME]
-    rest = fil.settings[K_STILL_TIME]
-    common = shared.common
-    best = heaviest(bank)
-    i_v = fil.at[SPEED]
-    if abs(bank.x[best, i_v]) > 0.5 + 3.0 * math.sqrt(variance_of(bank.P_sqrt[best], i_v)):
-        return False
-    spoken = common[C_GNSS_SPEED_TIME] > time - 2.5
-    if common[C_WHEEL_SEEN] > time - 1.0:
-        if spoken and common[C_GNSS_SPEED] > 1.0:
-            return False
-        return time - common[C_WHEEL_MOVED] >= rest
-    if not (spoken and common[C_SUSPECTS] == 0.0 and time > common[C_DISTRUST]):
-        return False
-    force = row[FORCE]
-    if time - common[C_GNSS_STILL] < 3.0 * rest:
-        common[C_FORCE_REST] = force
-        return False
-    if force == force:
-        if abs(force - common[C_FORCE_REST]) > LEAVING:
-            common[C_GNSS_STILL] = time
-            return False
-        common[C_FORCE_REST] += 0.05 * (force - common[C_FORCE_REST])
-    return True
-
-
-@part
-def depart(fil, bank, work):
-    """A train that stood leaves, and nothing tells which way: a clone of each hypothesis that has moved before goes back."""
-    reverse = fil.settings[K_REVERSE]
-    for i in range(bank.live[0]):
-        h = bank.live[1 + i]
-        if bank.tags[h, MOVED] == 1 and bank.live[0] < bank.used.shape[0]:
-            g = clone(bank, h)
-            bank.tags[g, SIGN] = -bank.tags[h, SIGN]
-            bank.logw[g] += math.log(reverse)
-            bank.logw[h] += math.log(1.0 - reverse)
-            for j in range(PULLS):
-                work.slot[g, j] = work.slot[h, j]
-
-
-@part
-def kick(fil, bank, work, row):
-    """A train that stood leaves: its acceleration is anything a train can do, and its speed what the receiver may already say."""
-    i_v, i_a = fil.at[SPEED], fil.at[ACCELERATION]
-    sigma = 0.3 + (row[GNSS_SPEED] if row[GNSS_SPEED] == row[GNSS_SPEED] else 0.0)
-    for i in range(bank.live[0]):
-        h = bank.live[1 + i]
-        widen(bank.P_sqrt[h], i_v, sigma, work.vector[W_COLUMN])
-        if i_a >= 0:
-            widen(bank.P_sqrt[h], i_a, KICK, work.vector[W_COLUMN])
-        work.slot[h, S_SHAKE] += sigma * sigma
 
 
 @part
@@ -345,7 +206,7 @@ def adapt(fil, shared, bank, work, time, dt):
     if abs(new / old - 1.0) > 0.2:
         for i in range(bank.live[0]):
             h = bank.live[1 + i]
-            bank.logw[h] += reweigh_frame(
+            change = reweigh_frame(
                 bank.x[h],
                 bank.P_sqrt[h],
                 old,
@@ -355,10 +216,27 @@ def adapt(fil, shared, bank, work, time, dt):
                 work.vector[W_KEEP],
                 work.vector[W_MOVE],
             )
+            bank.info[h, FADING] += change
         common[C_FRAME_SIGMA] = new
 
 
 # ---------------------------------------------------------------- the steps of one epoch
+
+
+@part
+def stretch_variance(fil, point, travel):
+    """Variance of what the model's length is wrong by over some metres.
+
+    An axis that is off by y across in curvature kappa is longer by kappa y a metre; where it is known by smoothness alone (sigma of
+    metres) its bearing is wrong, too, which only lengthens. Both last over the length that the error across is correlated over.
+    """
+    sigma = point[P_SIGMA_CROSS]
+    if fil.at[MAP_CROSS] < 0 or sigma <= 0.0:
+        return 0.0
+    length = fil.settings[K_MAP_LENGTH]
+    tilt = sigma / BLIND_LENGTH
+    rate = abs(point[P_CURVATURE]) * sigma + 0.5 * tilt * tilt
+    return 2.0 * length * rate * rate * travel
 
 
 @part
@@ -377,6 +255,11 @@ def predict_all(fil, net, bank, work, row, dt):
         path_point(net, bank, h, x[i_s] + 0.5 * dt * x[i_v], work.probe)
         slot[S_PULL] = gravity_pull(k[K_GRAVITY], work.probe[P_GRADIENT])
         slot[S_SIGN] = direction(fil, bank, h)
+        slot[S_TRAVEL] = abs(dt * x[i_v])
+        slot[S_STRETCH] = stretch_variance(fil, work.probe, slot[S_TRAVEL])
+        poor = work.probe[P_SIGMA_CROSS] / fil.map_sigma if fil.map_sigma > 0.0 else 0.0
+        if poor > 1.0:  # what the model is wrong by where it is poor does not outlast that
+            slot[S_TRAVEL] *= poor * poor
         columns = transition(
             fil,
             x,
@@ -388,6 +271,8 @@ def predict_all(fil, net, bank, work, row, dt):
             0.0,
             0.0,
             0.0,
+            slot[S_TRAVEL],
+            slot[S_STRETCH],
             work.F,
             work.Q,
             work.lead,
@@ -423,9 +308,10 @@ def follow_all(fil, net, shared, bank, work):
                 for j in range(x.shape[0]):
                     h_row[j] = 0.0
                 h_row[i_s] = 1.0
-                bank.logw[h] += robust_row(
+                held = robust_row(
                     x, P_sqrt, h_row, far - x[i_s], 1.0, work.vector[W_F], work.vector[W_KEEP], work.vector[W_MOVE]
                 )
+                credit(bank, h, BY_PATH, held)
             elif abs(x[i_s] - far) > 3.0 * sd + 5.0:
                 gone = True
                 shared.common[C_NOTHING_NEAR] = 1.0
@@ -464,16 +350,16 @@ def sense_all(fil, net, shared, bank, work, row, dt):
         x = bank.x[h]
         if wheel:
             evidence, slip, shake = wheel_row(fil, shared, bank, work, h, row)
-            bank.logw[h] += evidence
+            credit(bank, h, BY_ODOMETER, evidence)
             work.slot[h, S_SLIP] = slip
             work.slot[h, S_SHAKE] += shake
         path_point(net, bank, h, x[i_s], work.point[h])
         work.point[h, POINT_SIZE] = x[i_s]
-        bank.logw[h] += motion_rows(fil, net, shared, bank, work, h, row, dt, still)
+        motion_rows(fil, net, shared, bank, work, h, row, dt, still)
         if bank.tags[h, MOVED] == 0 and abs(x[i_v]) > max(0.5, 3.0 * math.sqrt(variance_of(bank.P_sqrt[h], i_v))):
             bank.tags[h, MOVED] = 1
             reverse = fil.settings[K_REVERSE]
-            bank.logw[h] += math.log(reverse if x[i_v] < 0.0 else 1.0 - reverse)
+            credit(bank, h, BY_PATH, math.log(reverse if x[i_v] < 0.0 else 1.0 - reverse))
 
 
 @part
@@ -568,11 +454,19 @@ def fix_all(fil, net, shared, bank, work, row):
     # the evidence of positions fades: errors longer than any correlation time must not add up to certainty
     since = time - common[C_FIX_TIME]
     fade = math.exp(-since / k[K_MEMORY])
+    top = -np.inf
     for i in range(bank.live[0]):
         h = bank.live[1 + i]
-        old = bank.info[h, FADING]
-        bank.info[h, FADING] = fade * old + work.slot[h, S_SAID] - most
-        bank.logw[h] += bank.info[h, FADING] - old
+        bank.info[h, FADING] = fade * bank.info[h, FADING] + work.slot[h, S_SAID] - most
+        top = max(top, bank.info[h, FADING])
+    # and it is never beyond doubt: now and then model and receiver are both farther off than they say (a contaminated normal law)
+    doubt = k[K_POSITION_DOUBT]
+    for i in range(bank.live[0]):
+        h = bank.live[1 + i]
+        said = bank.info[h, FADING] - top
+        said = math.log((1.0 - doubt) * math.exp(said) + doubt * math.exp(said / DOUBTED))
+        credit(bank, h, BY_POSITION, said - bank.info[h, BELIEVED])
+        bank.info[h, BELIEVED] = said
     common[C_JUMPS] *= math.exp(-since / 30.0)
     if step > 0.0:
         common[C_JUMPS] += 1.0
@@ -629,142 +523,6 @@ def keep_records(bank, work, records, epoch):
         used[0] = r + 1
 
 
-# ---------------------------------------------------------------- what is said
-
-
-@part
-def lawful(bank, h, track, way):
-    """Whether a hypothesis' window passes the track that was put out last: then its path leads on from there."""
-    for i in range(bank.tags[h, COUNT]):
-        if bank.track[h, i] == track and bank.way[h, i] == way:
-            return True
-    return bank.track[h, bank.tags[h, CURRENT]] == track
-
-
-@part
-def choose(fil, shared, bank, work):
-    """Hypothesis to put out: the best on the most probable track, or -1 for one row apart when that is no lawful continuation."""
-    common = shared.common
-    live = bank.live[0]
-    mass = work.slot[:, S_MASS]
-    for i in range(live):
-        h = bank.live[1 + i]
-        track = bank.track[h, bank.tags[h, CURRENT]]
-        mass[h] = 0.0
-        for j in range(live):
-            g = bank.live[1 + j]
-            if bank.track[g, bank.tags[g, CURRENT]] == track:
-                mass[h] += shared.weight[g]
-    best = -1
-    held = -1
-    last = int(common[C_OUT_TRACK])
-    for i in range(live):
-        h = bank.live[1 + i]
-        if best < 0 or _heavier(mass, bank.logw, h, best):
-            best = h
-        if (
-            last >= 0
-            and lawful(bank, h, last, int(common[C_OUT_WAY]))
-            and (held < 0 or _heavier(mass, bank.logw, h, held))
-        ):
-            held = h
-    if last < 0 or held == best:
-        return best
-    if held >= 0 and mass[best] < fil.settings[K_CONFIDENCE] and mass[best] < 3.0 * mass[held]:
-        return held
-    return -1
-
-
-@part
-def _heavier(mass, logw, a, b):
-    """Whether a stands on a more probable track than b, or is the heavier one on the same."""
-    return mass[a] > mass[b] + 1e-12 or (mass[a] > mass[b] - 1e-12 and logw[a] > logw[b])
-
-
-@part
-def put_out(fil, net, shared, bank, work, row, out):
-    """Fill one output row from the posterior: the track, where on it, its probability, the mode and the protection level."""
-    k = fil.settings
-    at = fil.at
-    common = shared.common
-    for j in range(OUTPUT_SIZE):
-        out[j] = np.nan
-    live = bank.live[0]
-    out[OUT_TRACK] = -1.0
-    out[OUT_HYPOTHESES] = live
-    out[OUT_FIX_AGE] = row[TIME] - common[C_FIX_TIME]
-    if live == 0:
-        common[C_OUT_TRACK] = -1.0
-        out[OUT_MODE] = INITIALISING
-        if common[C_NOTHING_NEAR] == 1.0:
-            out[OUT_MODE] = OFF_MODEL
-        elif common[C_STARTED] == 1.0:
-            out[OUT_MODE] = LOST
-        return
-    h = choose(fil, shared, bank, work)
-    if h < 0:
-        common[C_OUT_TRACK] = -1.0
-        common[C_REVISIONS] += 1.0
-        out[OUT_MODE] = LOST
-        return
-    i_s, i_v = at[POSITION], at[SPEED]
-    point = work.point
-    i = bank.tags[h, CURRENT]
-    track, way = bank.track[h, i], bank.way[h, i]
-    length = net.length[track]
-    # all hypotheses along the chosen one's tangent; those on its track make the estimate
-    te, tn = point[h, P_D_EAST], point[h, P_D_NORTH]
-    size = te * te + tn * tn
-    middle = 0.0
-    variance = 0.0
-    forward = 0.0
-    probability = 0.0
-    for j in range(live):
-        g = bank.live[1 + j]
-        w = shared.weight[g]
-        p = variance_of(bank.P_sqrt[g], i_s)
-        d = 0.0
-        if g != h:
-            d = ((point[g, P_EAST] - point[h, P_EAST]) * te + (point[g, P_NORTH] - point[h, P_NORTH]) * tn) / size
-        c = bank.tags[g, CURRENT]
-        if bank.track[g, c] == track:
-            probability += w
-            middle += w * d
-            variance += w * (p + d * d)
-            if bank.way[g, c] == way:
-                forward += w
-        work.mix[0, j] = w
-        work.mix[1, j] = d
-        work.mix[2, j] = math.sqrt(p)
-    middle /= probability
-    variance = variance / probability - middle * middle
-    for j in range(live):
-        work.mix[1, j] -= middle
-    local = min(max(bank.x[h, i_s] + middle - bank.begin[h, i], 0.0), length)
-    out[OUT_TRACK] = track
-    out[OUT_WAY] = way
-    out[OUT_OFFSET] = local if way > 0 else length - local
-    out[OUT_SPEED] = bank.x[h, i_v]
-    out[OUT_SIGMA_SPEED] = math.sqrt(variance_of(bank.P_sqrt[h], i_v))
-    if at[ACCELERATION] >= 0:
-        out[OUT_ACCELERATION] = bank.x[h, at[ACCELERATION]]
-    elif row[FORCE] == row[FORCE]:
-        pull = gravity_pull(k[K_GRAVITY], point[h, P_GRADIENT])
-        out[OUT_ACCELERATION] = row[FORCE] - bank.x[h, at[ACCELEROMETER_BIAS]] - pull
-    out[OUT_SIGMA] = math.sqrt(variance)
-    out[OUT_PROBABILITY] = min(probability, 1.0)
-    out[OUT_LEVEL] = mixture_bound(work.mix[0], work.mix[1], work.mix[2], live, fil.risk[0], fil.risk[1])
-    out[OUT_DIRECTION] = way if forward >= DIRECTION_CONFIDENCE * probability else 0.0
-    if probability < k[K_CONFIDENCE]:
-        out[OUT_MODE] = AMBIGUOUS
-    elif row[TIME] - common[C_FIX_TIME] > k[K_COASTING]:
-        out[OUT_MODE] = COASTING
-    else:
-        out[OUT_MODE] = TRACKING
-    common[C_OUT_TRACK] = track
-    common[C_OUT_WAY] = way
-
-
 # ---------------------------------------------------------------- the loop
 
 
@@ -810,7 +568,7 @@ def _compiled(stamp: int) -> Any:
     """The loop, bound to the checksum of the sources that it is made of."""
 
     @njit(cache=True, _nrt=False)
-    def run(fil, net, shared, bank, work, records, epochs, first, out):
+    def run(fil, net, shared, bank, work, records, journal, epochs, first, out):
         """Work through the epochs from `first`; gives where it stopped and why."""
         # epochs (m, EPOCH_SIZE), out (m, OUTPUT_SIZE)
         if stamp < 0:  # never: it makes the checksum part of the cache's key
@@ -823,6 +581,8 @@ def _compiled(stamp: int) -> Any:
                 records.used[0] + slots > records.x.shape[0] or records.used[1] + slots > records.track.shape[0]
             ):
                 return e, NEEDS_ROOM
+            if journal.used[1] > 0 and journal.used[0] + slots > journal.lines.shape[0]:
+                return e, NEEDS_ROOM
             seen = row[EAST] == row[EAST] and row[SIGMA_EAST] <= usable and row[SIGMA_NORTH] <= usable
             if bank.live[0] == 0 and seen and not row[TIME] - shared.common[C_TRY] < 1.0:
                 return e, NEEDS_START
@@ -832,9 +592,12 @@ def _compiled(stamp: int) -> Any:
             advance(fil, net, shared, bank, work, records, row, e)
             remember(shared, row)
             put_out(fil, net, shared, bank, work, row, out[e])
+            if journal.used[1] > 0:
+                keep_journal(fil, net, shared, bank, journal, e, out[e])
+            shared.common[C_OUT_MODE] = out[e, OUT_MODE]
         return epochs.shape[0], DONE
 
     return run
 
 
-run = _compiled(source_stamp(paths, columns, state, units, dynamics, integrity, measurements))
+run = _compiled(source_stamp(paths, columns, state, units, dynamics, integrity, measurements, standing, decision))

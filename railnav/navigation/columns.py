@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from railnav.matching._kernels import ENTRIES
 from railnav.navigation.solution import Mode
 from railnav.navigation.state import SETTING, State
 
@@ -19,6 +20,7 @@ FRAME_EAST, FRAME_NORTH, GNSS_EAST, GNSS_NORTH = (
     int(State.GNSS_EAST),
     int(State.GNSS_NORTH),
 )
+MAP_CROSS = int(State.MAP_CROSS)
 TIME_TAG, SPEED_LATENCY, SPEED_ERROR = int(State.TIME_TAG), int(State.SPEED_LATENCY), int(State.SPEED_ERROR)
 ODOMETER_SCALE, GYRO_BIAS, ACCELEROMETER_BIAS = (
     int(State.ODOMETER_SCALE),
@@ -48,6 +50,7 @@ K_WHITE = SETTING["gnss_white_share"]
 K_FRAME = SETTING["gnss_frame_share"]
 K_FRAME_LEAST = SETTING["frame_sigma_least"]
 K_MODEL = SETTING["model_sigma"]
+K_MAP_LENGTH = SETTING["model_length"]
 K_FRAME_MOST = SETTING["frame_sigma_most"]
 K_SCALE_START = SETTING["scale_start"]
 K_SCALE_PRIOR = SETTING["scale_prior"]
@@ -73,6 +76,7 @@ K_CURVATURE_SIGMA = SETTING["curvature_sigma"]
 K_CURVATURE_SHIFT = SETTING["curvature_shift"]
 K_CURVATURE_LENGTH = SETTING["curvature_length"]
 K_CURVATURE_DOUBT = SETTING["curvature_doubt"]
+K_COURSE_DOUBT = SETTING["course_doubt"]
 K_ODOMETER_WALK = SETTING["odometer_scale_walk"]
 K_ODOMETER_SIGMA = SETTING["odometer_sigma"]
 K_ODOMETER_SLIP = SETTING["odometer_slip"]
@@ -87,6 +91,7 @@ K_COASTING = SETTING["coasting_after"]
 K_LOST_SIGMA = SETTING["lost_sigma"]
 K_USABLE = SETTING["sigma_usable"]
 K_MEMORY = SETTING["evidence_memory"]
+K_POSITION_DOUBT = SETTING["position_doubt"]
 K_MERGE = SETTING["merge_distance"]
 K_PRUNE = SETTING["prune_below"]
 K_MOST = SETTING["most_hypotheses"]
@@ -168,8 +173,11 @@ OUTPUT_SIZE = 13
     C_FORCE_REST,  # specific force of the train at rest, slowly averaged
     C_START_TIME,
     C_RIVAL_TIME,  # when tracks nearby were last given a rival hypothesis
-) = range(36)
-COMMON_SIZE = 36
+    C_UNSEEN,  # probability that the train is on a track that begins farther on
+    C_OUT_MODE,
+    C_TOLD_TRACK,  # as in the row before, -1 where there was none
+) = range(39)
+COMMON_SIZE = 39
 #: How often tracks nearby that no hypothesis holds are given a rival, s.
 RIVAL_INTERVAL = 60.0
 #: Odometer readings remembered: time, distance.
@@ -194,6 +202,8 @@ KICK = 0.7
 SILENT_NOISE = 0.4
 #: Squared normalised innovation at which a single sensor row is held; its evidence saturates there.
 ROW_GATE = 16.0
+#: How much weaker the evidence of positions is when model or receiver are off by more than they say: sigmas five times as large.
+DOUBTED = 25.0
 #: Change of curvature a metre that the linearised course allows for, 1/m^2.
 BEND_CHANGE = 1e-5
 
@@ -201,21 +211,27 @@ BEND_CHANGE = 1e-5
 BLIND_LENGTH = 200.0
 
 #: Columns of a record's numbers, kept for the smoother.
-R_EPOCH, R_PARENT, R_VERSION, R_LOGW, R_PULL, R_SLIP, R_SHAKE, R_STEP, R_TAG, R_SIGN = range(10)
-RECORD_SIZE = 10
+R_EPOCH, R_PARENT, R_VERSION, R_LOGW, R_PULL, R_SLIP, R_SHAKE, R_STEP, R_TAG, R_SIGN, R_TRAVEL, R_STRETCH = range(12)
+RECORD_SIZE = 12
 #: Those of them that the filter fills as it goes: from R_PULL on.
-PULLS = 6
+PULLS = 8
 
 #: Rows of `Work.vector`.
 W_NEW, W_H, W_F, W_KEEP, W_MOVE, W_COLUMN, W_BEFORE = range(7)
 #: Columns of `Work.slot`: what the filter did to a hypothesis (PULLS numbers as in a record), NIS and ln p of the fix, track's posterior.
-S_PULL, S_SLIP, S_SHAKE, S_STEP, S_TAG, S_SIGN, S_NIS, S_SAID, S_MASS = range(9)
-SLOT_SIZE = 9
+S_PULL, S_SLIP, S_SHAKE, S_STEP, S_TAG, S_SIGN, S_TRAVEL, S_STRETCH, S_NIS, S_SAID, S_MASS = range(11)
+SLOT_SIZE = 11
 #: Noise columns at most.
 NOISES = 16
 
 #: Why the loop stopped.
 DONE, NEEDS_START, NEEDS_ROOM, NEEDS_RIVALS = range(4)
+
+#: Columns of a line in the journal; the ledger of evidence follows, then the row is full.
+J_EPOCH, J_DECISION, J_TRACK, J_WAY, J_OFFSET, J_WEIGHT, J_SIGMA, J_SPEED = range(8)
+JOURNAL_SIZE = 8 + ENTRIES
+#: Candidates below this posterior are not written down.
+J_LEAST = 1e-4
 
 GAUSS_HERMITE_NODES = np.array([-2.8569700138728056, -1.355626179974266, 0.0, 1.355626179974266, 2.8569700138728056])
 GAUSS_HERMITE_WEIGHTS = np.array(
@@ -226,11 +242,12 @@ GAUSS_HERMITE_WEIGHTS = np.array(
 class Filter(NamedTuple):
     """What stays the same over a run."""
 
-    at: IntArray  # (14,) index of each state, -1 absent
+    at: IntArray  # (15,) index of each state, -1 absent
     settings: FloatArray  # Settings.packed()
     lever: FloatArray  # (3,) reference point to antenna: forward, right, down, m
     risk: FloatArray  # (2,) integrity risk, two-sided normal quantile
     signed: int  # 1: the odometer counts backwards when backing up
+    map_sigma: float = 0.0  # usual error of the model across its tracks, m
 
 
 class Shared(NamedTuple):
@@ -255,6 +272,13 @@ class Work(NamedTuple):
     fix: FloatArray  # (slots, 7): innovation E, N; white variance E, N; innovation covariance EE, NN, EN
     slot: FloatArray  # (slots, SLOT_SIZE): S_...
     mix: FloatArray  # (3, slots): weight, mean, sigma along the track
+
+
+class Journal(NamedTuple):
+    """Candidates by epoch: lines of alternatives and of decisions. Empty when neither is kept."""
+
+    lines: FloatArray  # (lines, JOURNAL_SIZE)
+    used: IntArray  # (2,) lines, what is kept: 0 nothing, 1 decisions, 2 alternatives, 3 both
 
 
 class Records(NamedTuple):

@@ -29,6 +29,10 @@ IntArray = NDArray[np.int64]
 SLOTS, WINDOW = 48, 12
 #: Most that a rival can gain or lose by the GNSS error that the train on its track would have, nat.
 RIVAL_CREDIT = 6.0
+#: A model's error across its tracks beyond this is estimated, m; what is smaller counts towards the constant part.
+MAP_ERROR_LEAST = 0.1
+#: How near to a start a track may begin that the train may be making for, m, and how often such tracks are looked for, s.
+LOOSE_REACH, LOOSE_INTERVAL = 1000.0, 5.0
 
 
 class Engine:
@@ -42,13 +46,18 @@ class Engine:
         As for `railnav.navigation.Navigator`.
     records : int
         Room for the smoother's records, to begin with; 0 keeps none.
+    journal : int
+        What is written down of candidates: 0 nothing, 1 decisions, 2 alternatives, 3 both.
     """
 
     __slots__ = (
         "_component",
+        "_loose",
+        "_unseen",
         "bank",
         "filter",
         "frame",
+        "journal",
         "latitude",
         "model",
         "network",
@@ -72,6 +81,7 @@ class Engine:
         integrity_risk: float,
         receiver: str = "",
         records: int = 0,
+        journal: int = 0,
     ) -> None:
         if not 0.0 < integrity_risk < 1.0:
             raise ValueError(f"integrity_risk {integrity_risk} is not between 0 and 1")
@@ -89,9 +99,18 @@ class Engine:
                 gnss_frame_share=0.0 if self.frame.known else self.settings.gnss_frame_share,
             )
         self.network = pack_network(model)
+        self._loose = _loose_ends(model, self.network)
+        self._unseen: dict[int, float] = {}
         middle, _, _ = model.frame.to_geodetic(model.easting[[0, -1]].mean(), model.northing[[0, -1]].mean(), None)
         self.latitude = float(middle)
-        at = layout(imu=imu, odometer=odometer, speed=speed)
+        map_error = bool(len(self.network.sigma_cross)) and np.quantile(self.network.sigma_cross, 0.9) > MAP_ERROR_LEAST
+        if map_error:
+            self.settings = replace(
+                self.settings,
+                position_doubt=min(100.0 * self.settings.position_doubt, 0.1),
+                evidence_memory=self.settings.evidence_memory / 3.0,
+            )
+        at = layout(imu=imu, odometer=odometer, speed=speed, map_error=bool(map_error))
         n = int(at.max()) + 1
         self.filter = c.Filter(
             at,
@@ -99,6 +118,7 @@ class Engine:
             np.array(lever_arm_b, np.float64).reshape(3),
             np.array([integrity_risk, normal_quantile(integrity_risk)]),
             int(signed_odometer),
+            float(np.median(self.network.sigma_cross)) if map_error else 0.0,
         )
         self.bank = paths.Bank(
             np.zeros((SLOTS, n)),
@@ -118,7 +138,7 @@ class Engine:
         common[never] = -np.inf
         common[[c.C_WHEEL_MOVED, c.C_GNSS_STILL]] = np.inf
         common[c.C_SCALE] = self.settings.scale_start
-        common[c.C_OUT_TRACK] = -1.0
+        common[[c.C_OUT_TRACK, c.C_TOLD_TRACK]] = -1.0
         ring = np.column_stack([np.full(c.RING, -np.inf), np.full(c.RING, np.nan)])
         self.shared = c.Shared(common, ring, np.zeros(SLOTS))
         self.work = c.Work(
@@ -135,6 +155,7 @@ class Engine:
             np.zeros((3, SLOTS)),
         )
         self.records = _records(n, records)
+        self.journal = c.Journal(np.empty((1000 if journal else 0, c.JOURNAL_SIZE)), np.array([0, journal], np.int64))
 
     @property
     def states(self) -> int:
@@ -145,12 +166,24 @@ class Engine:
         """Work through the rows of an epoch table from `first`, starting hypotheses and making room where the loop asks for it."""
         while True:
             first, why = kernel.run(
-                self.filter, self.network, self.shared, self.bank, self.work, self.records, table, first, out
+                self.filter,
+                self.network,
+                self.shared,
+                self.bank,
+                self.work,
+                self.records,
+                self.journal,
+                table,
+                first,
+                out,
             )
             if why == c.DONE:
                 return
             if why == c.NEEDS_ROOM:
-                self.records = _grown(self.records)
+                if self.records.used[2] == 1:
+                    self.records = _grown(self.records)
+                if self.journal.used[1] > 0:
+                    self.journal = c.Journal(_doubled(self.journal.lines), self.journal.used)
             elif why == c.NEEDS_RIVALS:
                 self._give_rivals(table[first])
             else:
@@ -209,6 +242,7 @@ class Engine:
             sigma_speed = settings.speed_sigma
         paths.drop_all(bank)
         point = np.empty(paths.POINT_SIZE)
+        total = 0.0
         for start in found:
             paths.track_point(self.network, start.track, 1, start.offset, point)
             for way, v, sigma_v, moved, prior in self._directions(row, point, speed, sigma_speed):
@@ -219,6 +253,7 @@ class Engine:
                 self._seed(h, local, v, sigma, sigma_v)
                 if usual := int(self.usual[start.track]):
                     prior *= USUAL if way == usual else 1.0 - USUAL
+                total += prior
                 bank.logw[h] = math.log(prior)
                 bank.track[h, 0], bank.way[h, 0], bank.begin[h, 0] = start.track, way, 0.0
                 bank.armed[h] = 0
@@ -227,8 +262,32 @@ class Engine:
                 bank.tags[h, [paths.RECORD, paths.VERSION]] = -1
                 bank.tags[h, paths.MOVED] = int(moved)
                 bank.tags[h, paths.SIGN] = 1 if v >= 0.0 else -1
-                bank.info[h] = -np.inf
-                bank.info[h, paths.FADING] = 0.0
+                bank.info[h] = 0.0
+                bank.info[h, [paths.SLIP_SINCE, paths.AGREE_SINCE]] = -np.inf
+                bank.info[h, paths.BY_PATH] = math.log(prior)
+
+        self._foresee(row, {start.track for start in found}, total)
+
+    def _foresee(self, row: FloatArray, found: set[int], total: float) -> None:
+        """Weigh tracks that begin near a start and hold no candidate: the train may be on its way to them, outside the model.
+
+        Until it has come alongside them or gone elsewhere, that share of the probability belongs to no candidate.
+        """
+        distance = np.hypot(self._loose[:, 2] - row[c.EAST], self._loose[:, 3] - row[c.NORTH])
+        self._unseen = {}
+        for track, way, *_ in self._loose[distance < LOOSE_REACH].tolist():
+            if int(track) not in found:
+                usual = int(self.usual[int(track)])
+                prior = 1.0 if usual == 0 else USUAL if usual == int(way) else 1.0 - USUAL
+                self._unseen[int(track)] = prior / total
+        self._share_unseen(row)
+
+    def _share_unseen(self, row: FloatArray) -> None:
+        """State the probability of tracks not met yet; look for them often while there are any."""
+        odds = sum(self._unseen.values())
+        self.shared.common[c.C_UNSEEN] = odds / (1.0 + odds)
+        if self._unseen:
+            self.shared.common[c.C_RIVAL_TIME] = float(row[c.TIME]) - c.RIVAL_INTERVAL + LOOSE_INTERVAL
 
     def _give_rivals(self, row: FloatArray) -> None:
         """Put a faint hypothesis on every track near the fix that no hypothesis holds.
@@ -259,15 +318,34 @@ class Engine:
             overhang=0.0,
         )
         here = point[[paths.P_EAST, paths.P_NORTH]].copy()
-        at, n = self.filter.at, self.states
-        blind = [int(at[s]) for s in (State.FRAME_EAST, State.FRAME_NORTH, State.GNSS_EAST, State.GNSS_NORTH)]
+        at = self.filter.at
+        blind = [
+            int(at[s])
+            for s in (State.FRAME_EAST, State.FRAME_NORTH, State.GNSS_EAST, State.GNSS_NORTH, State.MAP_CROSS)
+            if at[s] >= 0
+        ]
         spread = common[c.C_SCALE] * settings.gnss_correlated_share * row[[c.SIGMA_EAST, c.SIGMA_NORTH]]
-        error = bank.x[best, blind[:2]] + spread * bank.x[best, blind[2:]]
+        error = bank.x[best, blind[:2]] + spread * bank.x[best, blind[2:4]]
         for start in found:
-            if start.track in held:
+            linked = self._component[start.track] == self._component[track]
+            if start.track in held and linked:
                 continue
             paths.track_point(self.network, start.track, 1, start.offset, point)
             way = 1 if float(bearing @ point[[paths.P_D_EAST, paths.P_D_NORTH]]) > 0.0 else -1
+            usual = {0: 1.0, way: USUAL, -way: 1.0 - USUAL}[int(self.usual[start.track])]
+            before = int(self.usual[track])
+            usual /= 1.0 if before == 0 else USUAL if before == self._way(best) else 1.0 - USUAL
+            error_there = error + here - point[[paths.P_EAST, paths.P_NORTH]]
+            variance = spread**2 + common[c.C_FRAME_SIGMA] ** 2 + point[paths.P_SIGMA_CROSS] ** 2
+            likelier = float(np.clip(0.5 * np.sum((error**2 - error_there**2) / variance), -RIVAL_CREDIT, RIVAL_CREDIT))
+            odds = self._unseen.pop(start.track, 0.0) or settings.rival_prior * (0.01 if linked else 1.0) * usual
+            weight = float(bank.logw[best]) + likelier + math.log(odds)
+            if start.track in held:  # a train may have crossed over where the model has no turnout
+                there = max((g for g in living if self.place(g)[0] == start.track), key=lambda g: float(bank.logw[g]))
+                raised = float(np.logaddexp(bank.logw[there], weight)) - float(bank.logw[there])
+                bank.info[there, paths.BY_PATH] += raised
+                bank.logw[there] += raised
+                continue
             h = paths.take_slot(bank)
             if h < 0:
                 return
@@ -277,26 +355,45 @@ class Engine:
             P[blind[:2], blind[:2]] = common[c.C_FRAME_SIGMA] ** 2
             P[blind[2:], blind[2:]] = 1.0
             P[at[State.POSITION], at[State.POSITION]] += 1.0
-            bank.x[h, :n], bank.P_sqrt[h] = bank.x[best], np.linalg.cholesky(P)
-            bank.x[h, blind] = 0.0
-            bank.x[h, at[State.POSITION]] = local
-            usual = {0: 1.0, way: USUAL, -way: 1.0 - USUAL}[int(self.usual[start.track])]
-            before = int(self.usual[track])
-            usual /= 1.0 if before == 0 else USUAL if before == self._way(best) else 1.0 - USUAL
-            error_there = error + here - point[[paths.P_EAST, paths.P_NORTH]]
-            variance = spread**2 + common[c.C_FRAME_SIGMA] ** 2
-            likelier = float(np.clip(0.5 * np.sum((error**2 - error_there**2) / variance), -RIVAL_CREDIT, RIVAL_CREDIT))
-            linked = self._component[start.track] == self._component[track]
-            bank.logw[h] = (
-                bank.logw[best] + likelier + math.log(settings.rival_prior * (0.01 if linked else 1.0) * usual)
-            )
+            x = bank.x[best].copy()
+            x[blind] = 0.0
+            x[at[State.POSITION]] = local
+            bank.x[h], bank.P_sqrt[h] = self._believing(x, P, error_there, spread, point)
+            bank.logw[h] = weight
             bank.track[h, 0], bank.way[h, 0], bank.begin[h, 0] = start.track, way, 0.0
             bank.armed[h] = 0
             bank.tags[h] = bank.tags[best]
             bank.tags[h, [paths.COUNT, paths.CURRENT]] = 1, 0
             bank.tags[h, [paths.RECORD, paths.VERSION]] = -1
             bank.info[h] = bank.info[best]
-            bank.info[h, paths.FADING] = 0.0
+            bank.info[h, [paths.FADING, paths.BELIEVED]] += likelier
+            bank.info[h, paths.BY_PATH] += math.log(odds)
+            bank.info[h, paths.BY_POSITION] += likelier
+        if self._unseen:
+            away = np.hypot(self._loose[:, 2] - here[0], self._loose[:, 3] - here[1])
+            near = set(self._loose[away < 2.0 * LOOSE_REACH, 0].astype(int).tolist())
+            self._unseen = {t: odds for t, odds in self._unseen.items() if t in near and t not in held}
+        if common[c.C_UNSEEN] > 0.0:
+            self._share_unseen(row)
+
+    def _believing(
+        self, x: FloatArray, P: FloatArray, error: FloatArray, spread: FloatArray, point: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """State and root of a rival told the GNSS error that the train on its track has: what its credit has paid for already."""
+        at = self.filter.at
+        across = point[paths.P_SIGMA_CROSS] / math.hypot(point[paths.P_D_EAST], point[paths.P_D_NORTH])
+        normal = across * np.array([point[paths.P_D_NORTH], -point[paths.P_D_EAST]])
+        for axis in range(2):
+            row = np.zeros(len(x))
+            row[at[State.FRAME_EAST] + axis] = 1.0
+            row[at[State.GNSS_EAST] + axis] = spread[axis]
+            if at[State.MAP_CROSS] >= 0:
+                row[at[State.MAP_CROSS]] = normal[axis]
+            column = P @ row
+            gain = column / (row @ column + (0.3 * spread[axis]) ** 2)
+            x = x + gain * (error[axis] - row @ x)
+            P = P - np.outer(gain, column)
+        return x, np.asarray(np.linalg.cholesky(0.5 * (P + P.T)), np.float64)
 
     def _way(self, slot: int) -> int:
         """Direction in which a hypothesis' nose points on its track."""
@@ -352,7 +449,7 @@ def _settings_for(model: TrackModel, settings: Settings) -> Settings:
         variance = 0.5 * (model.covariance_g[:, 0] + model.covariance_g[:, 3])
         variance = variance[np.isfinite(variance)]
         if len(variance):
-            settings = replace(settings, model_sigma=math.sqrt(float(np.median(variance))))
+            settings = replace(settings, model_sigma=min(math.sqrt(float(np.median(variance))), MAP_ERROR_LEAST))
     if not np.isfinite(model.height).any():
         settings = replace(settings, accelerometer_walk=settings.accelerometer_walk + settings.gradient_walk)
     return settings
@@ -366,6 +463,24 @@ def _components(model: TrackModel) -> IntArray:
     t, m = len(model.track_id), model.movements
     links = coo_array((np.ones(len(m)), (m[:, 0], m[:, 2])), shape=(t, t))
     return np.asarray(connected_components(links, directed=False)[1], np.int64)
+
+
+def _doubled(array: NDArray[Any]) -> NDArray[Any]:
+    """Twice the room, what is there kept."""
+    larger = np.empty((2 * len(array), *array.shape[1:]), array.dtype)
+    larger[: len(array)] = array
+    return larger
+
+
+def _loose_ends(model: TrackModel, network: paths.Network) -> FloatArray:
+    """Ends of the model where a train may come in, (k, 5): track, way in, easting, northing, knot's usual direction not applied."""
+    t = len(model.track_id)
+    free = (np.diff(network.move_start) == 0) & (network.stop == 0)
+    ends = np.flatnonzero(free)
+    track, end = ends // 2, ends % 2
+    knot = np.where(end == 0, model.knot_start[:-1][track], model.knot_start[1:][track] - 1)
+    assert len(free) == 2 * t
+    return np.column_stack([track, 1 - 2 * end, model.easting[knot], model.northing[knot]]).astype(np.float64)
 
 
 def _records(n: int, records: int) -> c.Records:
@@ -385,19 +500,13 @@ def _records(n: int, records: int) -> c.Records:
 
 def _grown(records: c.Records) -> c.Records:
     """Twice the room of records and windows, what is there kept."""
-
-    def double(array: NDArray[Any]) -> NDArray[Any]:
-        larger = np.empty((2 * len(array), *array.shape[1:]), array.dtype)
-        larger[: len(array)] = array
-        return larger
-
     return c.Records(
-        double(records.x),
-        double(records.P_sqrt),
-        double(records.numbers),
-        double(records.track),
-        double(records.way),
-        double(records.begin),
-        double(records.tracks),
+        _doubled(records.x),
+        _doubled(records.P_sqrt),
+        _doubled(records.numbers),
+        _doubled(records.track),
+        _doubled(records.way),
+        _doubled(records.begin),
+        _doubled(records.tracks),
         records.used,
     )

@@ -19,6 +19,8 @@ IntArray = NDArray[np.int64]
 
 #: Prior probability that a train runs a one-way track the usual way; trains do run on the other track at times.
 USUAL = 0.95
+#: Tracks of one line lie this near to each other, m.
+BESIDE = 150.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,8 +80,9 @@ def frame_prior(model: TrackModel, receiver: str) -> FramePrior:
 def usual_directions(model: TrackModel) -> IntArray:
     """Usual running direction of each track, +1 to growing offset, 0 where nothing is known.
 
-    The runs of a track of a built model all ran to growing offset; where they name one direction and the model has another track for
-    another direction, that is the way the track is usually run.
+    Where the runs of a built model's track name one direction and the model has another track for another direction, that is the way
+    the track is usually run. Which way that is the report says ("sense" of a run); in a report that does not, the first run of
+    tracks that lie side by side ran to growing offset, and runs of another direction the other way.
 
     Parameters
     ----------
@@ -89,15 +92,46 @@ def usual_directions(model: TrackModel) -> IntArray:
     -------
     (t,) int array
     """
-    usual = np.zeros(len(model.track_id), np.int64)
+    tracks = len(model.track_id)
+    usual = np.zeros(tracks, np.int64)
     report = model.provenance.get("build")
     if not isinstance(report, dict):
         return usual
+    runs = report.get("runs", [])
     named: dict[str, set[str]] = {}
-    for run in report.get("runs", []):
+    first: dict[str, int] = {}
+    sense: dict[str, int] = {}
+    for i, run in enumerate(runs):
         for track in run.get("tracks", []):
             named.setdefault(track, set()).add(run.get("direction", ""))
+            first.setdefault(track, i)
+            sense.setdefault(track, int(run.get("sense", 0)))
     ways = [next(iter(named[t])) if len(named.get(t, ())) == 1 else "" for t in model.track_id]
-    if len({w for w in ways if w}) > 1:
-        usual[[bool(w) for w in ways]] = 1
+    if len({w for w in ways if w}) < 2:
+        return usual
+    order = sorted((t for t in range(tracks) if ways[t]), key=lambda t: first[model.track_id[t]])
+    leaders: list[int] = []
+    for t in order:
+        name = model.track_id[t]
+        if sense[name] != 0:
+            usual[t] = sense[name]
+            continue
+        leader, along = next(((k, a) for k in leaders if (a := _side_by_side(model, t, k)) != 0), (-1, 0))
+        if leader < 0:
+            leaders.append(t)
+            usual[t] = 1
+        else:
+            usual[t] = along if ways[t] == ways[leader] else -along
     return usual
+
+
+def _side_by_side(model: TrackModel, a: int, b: int) -> int:
+    """Whether a track's middle lies beside another track: +1 where their offsets grow the same way, -1 opposite, 0 where it does not."""
+    middle = int(model.knot_start[a] + model.knot_start[a + 1]) // 2
+    beside = slice(int(model.knot_start[b]), int(model.knot_start[b + 1]))
+    distance = np.hypot(model.easting[beside] - model.easting[middle], model.northing[beside] - model.northing[middle])
+    nearest = int(np.argmin(distance))
+    if float(distance[nearest]) > BESIDE:
+        return 0
+    turned = float(np.cos(model.grid_bearing[beside][nearest] - model.grid_bearing[middle]))
+    return 1 if turned > 0.0 else -1

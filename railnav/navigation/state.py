@@ -23,19 +23,22 @@ class State(IntEnum):
     FRAME_NORTH = 1
     GNSS_EAST = 2  # correlated part of the GNSS error, first-order Gauss-Markov with variance 1, times the fix's sigma
     GNSS_NORTH = 3
-    TIME_TAG = 4  # a fix stamped t shows where the train is at t + this, s: loggers round, lose and spread stamps
-    SPEED_LATENCY = 5  # how old the receiver's speed is, s: receivers smooth it, by 0.2 to 0.9 s
-    SPEED_ERROR = 6  # correlated part of its error, in units of its sigma
-    ODOMETER_SCALE = 7  # wheel distance = (1 + scale) * distance
-    GYRO_BIAS = 8  # yaw gyro, rad/s
-    ACCELEROMETER_BIAS = 9  # forward accelerometer, m/s^2; takes up the tilt of the mounting too
-    ACCELERATION = 10  # along the nose, m/s^2, Gauss-Markov; only where no accelerometer measures it
-    SPEED = 11  # along the nose, m/s: negative when backing up
-    POSITION = 12  # along the hypothesis' path, growing towards the nose, m
-    WHEEL_DISTANCE = 13  # what the odometer would read without its rounding, m
+    MAP_CROSS = (
+        4  # the model's own error across the hypothesis' track, in units of its stated sigma, correlated over a length
+    )
+    TIME_TAG = 5  # a fix stamped t shows where the train is at t + this, s: loggers round, lose and spread stamps
+    SPEED_LATENCY = 6  # how old the receiver's speed is, s: receivers smooth it, by 0.2 to 0.9 s
+    SPEED_ERROR = 7  # correlated part of its error, in units of its sigma
+    ODOMETER_SCALE = 8  # wheel distance = (1 + scale) * distance
+    GYRO_BIAS = 9  # yaw gyro, rad/s
+    ACCELEROMETER_BIAS = 10  # forward accelerometer, m/s^2; takes up the tilt of the mounting too
+    ACCELERATION = 11  # along the nose, m/s^2, Gauss-Markov; only where no accelerometer measures it
+    SPEED = 12  # along the nose, m/s: negative when backing up
+    POSITION = 13  # along the hypothesis' path, growing towards the nose, m
+    WHEEL_DISTANCE = 14  # what the odometer would read without its rounding, m
 
 
-def layout(*, imu: bool, odometer: str, speed: bool = True) -> IntArray:
+def layout(*, imu: bool, odometer: str, speed: bool = True, map_error: bool = False) -> IntArray:
     """Index of each state in the vector that a run needs, -1 where it needs none.
 
     Parameters
@@ -46,18 +49,21 @@ def layout(*, imu: bool, odometer: str, speed: bool = True) -> IntArray:
         "distance", "speed" or "" (none).
     speed : bool
         Whether the receiver gives a speed.
+    map_error : bool
+        Whether the model's own error across its tracks is large enough to be estimated.
 
     Returns
     -------
-    (14,) int array
+    (15,) int array
         Index by `State`.
 
     Examples
     --------
     >>> layout(imu=False, odometer="").tolist()
-    [0, 1, 2, 3, 4, 5, 6, -1, -1, -1, 7, 8, 9, -1]
+    [0, 1, 2, 3, -1, 4, 5, 6, -1, -1, -1, 7, 8, 9, -1]
     """
     needed = {
+        State.MAP_CROSS: map_error,
         State.SPEED_LATENCY: speed,
         State.SPEED_ERROR: speed,
         State.ODOMETER_SCALE: odometer != "",
@@ -91,7 +97,9 @@ class Settings:
     frame_sigma_least, frame_sigma_most : float
         Bounds of the constant part's sigma, m; it grows when a run's fixes lie aside by more than it allows.
     model_sigma : float
-        Standard deviation of the model's axis, m; counts towards the constant part.
+        Standard deviation of the model's frame, m; counts towards the constant part.
+    model_length : float
+        Length over which the model's error across its tracks is correlated, m; what is stated of it stands in the model's covariance.
     scale_start, scale_prior : float
         Factor on stated sigmas at the start, and the number of independent errors it is worth when it is scaled by what is seen.
     scale_least, scale_most : float
@@ -131,6 +139,8 @@ class Settings:
     curvature_sigma, curvature_shift, curvature_length : float
         Errors of the model's curvature: of its value, 1/m, of the place where it changes, m, and the length over which both are
         correlated, m.
+    course_doubt : float
+        Difference in bearing that does not tell one track from another, rad; a turnout's legs part by 0.05 and more.
     curvature_doubt : float
         Difference in curvature that does not tell one track from another, 1/m: what a surveyed model may be wrong by in
         transitions. Tracks side by side differ by less, a turnout's leg by ten times as much.
@@ -163,8 +173,12 @@ class Settings:
     sigma_usable : float
         Fixes with a stated sigma beyond this are not used, m.
     evidence_memory : float
-        How long the evidence of GNSS positions counts, s. Errors that last longer than any correlation time (a frame, a reflecting
-        wall, a logger's fault) tell the same again and again; they must not add up to certainty.
+        How long the evidence of GNSS positions counts, s; a third of it on a model with errors of its own. Errors that last longer
+        than any correlation time (a frame, a reflecting wall, a logger's fault) tell the same again and again; they must not add up
+        to certainty.
+    position_doubt : float
+        Probability that model and receiver are together five times as wrong as they say; a model with errors of its own (a build of
+        a few low-cost runs) is given a hundred times that.
     merge_distance : float
         Squared Mahalanobis distance below which hypotheses on one path are one.
     prune_below : float
@@ -182,6 +196,7 @@ class Settings:
     frame_sigma_least: float = 0.01
     frame_sigma_most: float = 20.0
     model_sigma: float = 0.0
+    model_length: float = 1000.0
     scale_start: float = 1.0
     scale_prior: float = 3.0
     scale_least: float = 0.6
@@ -210,6 +225,7 @@ class Settings:
     curvature_sigma: float = 2e-5
     curvature_shift: float = 0.4
     curvature_length: float = 20.0
+    course_doubt: float = 0.01
     curvature_doubt: float = 2e-4
     odometer_scale: float = 0.01
     odometer_scale_walk: float = 2e-6
@@ -226,7 +242,8 @@ class Settings:
     coasting_after: float = 3.0
     lost_sigma: float = 500.0
     sigma_usable: float = 60.0
-    evidence_memory: float = 200.0
+    evidence_memory: float = 600.0
+    position_doubt: float = 1e-4
     merge_distance: float = 1.0
     prune_below: float = 1e-6
     most_hypotheses: float = 16.0

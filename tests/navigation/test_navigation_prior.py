@@ -76,7 +76,7 @@ def test_a_known_receiver_brings_its_offset_and_an_unknown_one_the_datums_doubt(
 
 def test_tracks_run_one_way_only_when_the_survey_says_so(double_line):
     model, _, _ = double_line
-    assert usual_directions(model).tolist() == [1, 1]
+    assert usual_directions(model).tolist() == [1, 1]  # the tracks' offsets grow as their own runs went
     assert usual_directions(replace(model, provenance={})).tolist() == [0, 0]
     one_name = {"runs": [{"direction": "up", "tracks": ["up"]}, {"direction": "up", "tracks": ["down"]}]}
     assert usual_directions(replace(model, provenance={"build": one_name})).tolist() == [0, 0]
@@ -117,3 +117,48 @@ def test_a_known_offset_is_taken_off_before_it_chooses_the_track(double_line):
     assert (with_survey.track == 0).mean() > 0.9
     without = rn.navigate(run, replace(model, provenance={}))
     assert (without.track == 0).mean() < 0.5
+
+
+def test_the_usual_way_of_a_track_that_is_run_against_its_offsets(double_line):
+    """A build lets the offsets of all tracks of a line grow as its first run went: trains of the other direction run against them."""
+    frame = rn.demo_line().frame
+    east, north = frame.to_grid(np.radians(50.6), np.radians(7.9))[:2]
+    same = [
+        TrackSection(name, fit_alignment(frame, east + np.array([0.0, 6000.0]), north + np.full(2, aside)))
+        for name, aside in (("up", 0.0), ("down", 4.0))
+    ]
+    model = replace(assemble(frame, same), provenance={"build": REPORT})
+    assert usual_directions(model).tolist() == [1, -1]
+    told = [{**run, "sense": sense} for run, sense in zip(REPORT["runs"], (-1, 1), strict=True)]
+    assert usual_directions(replace(model, provenance={"build": {**REPORT, "runs": told}})).tolist() == [-1, 1]
+
+
+def test_a_lone_candidate_is_not_declared_where_another_track_begins_near(double_line):
+    """Out of reach of "up", which begins 280 m on: the train may be making for it, and is not said to be on "down" for certain."""
+    model, east, north = double_line
+    solution = rn.navigate(drive(model.frame, east, north), model)
+    alone = solution.time < 4.0
+    assert (solution.track[alone] == 1).all()
+    assert (solution.mode[alone] == rn.Mode.AMBIGUOUS).all()
+    assert (
+        solution.track_probability[alone].max() < 0.2
+    )  # run the unusual way, where the other track is run the usual one
+
+
+def usual_line(model, sigma):
+    """The model with a stated error across its tracks."""
+    covariance = np.zeros_like(model.covariance_g)
+    covariance[:, [0, 3]] = sigma**2
+    return replace(model, covariance_g=covariance, provenance={})
+
+
+def test_tracks_that_the_model_knows_to_metres_are_not_told_apart_by_gnss(double_line):
+    """The same fixes on the same axes: certain of the track where the model is exact, not where its axes may each be 2 m off."""
+    model, east, north = double_line
+    run = drive(model.frame, east + 400.0, north, sigma=0.5)
+    exact = rn.navigate(run, replace(model, provenance={}))
+    assert exact.track_probability[150] > 0.999
+    assert exact.track[150] == 0
+    vague = rn.navigate(run, usual_line(model, 2.0))
+    assert vague.track_probability[10:150].max() < 0.99
+    assert (vague.mode[10:150] == rn.Mode.AMBIGUOUS).all()

@@ -19,11 +19,13 @@ from railnav.navigation.columns import (
     K_FORCE_WALK,
     K_GNSS_TIME,
     K_GYRO_WALK,
+    K_MAP_LENGTH,
     K_ODOMETER_SLIP,
     K_ODOMETER_WALK,
     K_SPEED_TIME,
     K_TAG_WALK,
     KICK,
+    MAP_CROSS,
     ODOMETER_SCALE,
     POSITION,
     ROW_GATE,
@@ -36,11 +38,12 @@ from railnav.navigation.columns import (
 
 
 @part
-def transition(fil, x, dt, sign, force, pull, slip, shake, step, tag, F, Q, lead, new):
+def transition(fil, x, dt, sign, force, pull, slip, shake, step, tag, travel, stretch, F, Q, lead, new):
     """Fill the transition matrix F (lower triangular), the noise columns Q with their first rows and the predicted state (19.2).
 
     `sign` is the direction in which an unsigned odometer counts, `pull` is g sin(grade); the variances slip, shake, step and tag
-    forget the wheel distance, shake the speed, and let the GNSS error and its time stamps jump. Gives the number of noise columns.
+    forget the wheel distance, shake the speed, and let the GNSS error and its time stamps jump; over `travel` metres the model's error
+    across changes, and `stretch` is the variance of what the model's length is wrong by there. Gives the number of noise columns.
     """
     # x (n,), F (n, n), Q (NOISES, n) one noise column a row, lead (NOISES,), new (n,)
     at = fil.at
@@ -57,6 +60,12 @@ def transition(fil, x, dt, sign, force, pull, slip, shake, step, tag, F, Q, lead
     F[i_ge + 1, i_ge + 1] = phi
     new[i_ge] = phi * x[i_ge]
     new[i_ge + 1] = phi * x[i_ge + 1]
+    i_m = at[MAP_CROSS]
+    keep = 1.0
+    if i_m >= 0:
+        keep = math.exp(-travel / k[K_MAP_LENGTH])
+        F[i_m, i_m] = keep
+        new[i_m] = keep * x[i_m]
     i_e = at[SPEED_ERROR]
     fade = 1.0
     if i_e >= 0:
@@ -108,6 +117,12 @@ def transition(fil, x, dt, sign, force, pull, slip, shake, step, tag, F, Q, lead
             Q[c, j] = 0.0
         Q[c, i_ge + i] = math.sqrt(1.0 - phi * phi + step)
         lead[c] = i_ge + i
+        c += 1
+    if i_m >= 0:
+        for j in range(n):
+            Q[c, j] = 0.0
+        Q[c, i_m] = math.sqrt(1.0 - keep * keep)
+        lead[c] = i_m
         c += 1
     for j in range(n):
         Q[c, j] = 0.0
@@ -162,6 +177,12 @@ def transition(fil, x, dt, sign, force, pull, slip, shake, step, tag, F, Q, lead
                 Q[c, i_d] = rate * Q[c, i_s]
             lead[c] = i_v if m == 0 else i_s
             c += 1
+    if stretch > 0.0:
+        for j in range(n):
+            Q[c, j] = 0.0
+        Q[c, i_s] = math.sqrt(stretch)
+        lead[c] = i_s
+        c += 1
     if shake > 0.0:
         for j in range(n):
             Q[c, j] = 0.0

@@ -12,6 +12,11 @@ from numba import njit
 
 from railnav.matching._kernels import (
     AGREE_SINCE,
+    BY_COURSE,
+    BY_ODOMETER,
+    BY_SPEED,
+    BY_STANDSTILL,
+    BY_YAW,
     P_CANT,
     P_CURVATURE,
     P_D_EAST,
@@ -24,6 +29,7 @@ from railnav.matching._kernels import (
     POINT_SIZE,
     SIGN,
     SLIP_SINCE,
+    credit,
     part,
     path_point,
 )
@@ -52,6 +58,7 @@ from railnav.navigation.columns import (
     GNSS_SPEED,
     GYRO_BIAS,
     K_CORRELATED,
+    K_COURSE_DOUBT,
     K_COURSE_SIGMA,
     K_CURVATURE_DOUBT,
     K_CURVATURE_LENGTH,
@@ -60,7 +67,6 @@ from railnav.navigation.columns import (
     K_GRAVITY,
     K_GYRO_FLOOR,
     K_GYRO_SCALE,
-    K_MODEL,
     K_ODOMETER_SIGMA,
     K_ODOMETER_SPEED,
     K_SLIP_GATE,
@@ -70,6 +76,7 @@ from railnav.navigation.columns import (
     K_STILL_SIGMA,
     K_WHITE,
     KICK,
+    MAP_CROSS,
     NORTH,
     ODOMETER_SCALE,
     POSITION,
@@ -314,9 +321,9 @@ def speed_rows(fil, bank, work, h, row):
     v = x[i_v]
     if speed < 4.0 * sigma and abs(v) < 8.0 * sigma:  # near standstill the sign is not told
         h_row[i_v] = 1.0
-        evidence = robust_row(x, P_sqrt, h_row, -v, speed * speed + sigma * sigma, f, keep, move)
+        credit(bank, h, BY_SPEED, robust_row(x, P_sqrt, h_row, -v, speed * speed + sigma * sigma, f, keep, move))
         h_row[i_v] = 0.0
-        return evidence
+        return
     if course_east == course_east:
         sign = 1.0 if course_east * point[P_D_EAST] + course_north * point[P_D_NORTH] > 0.0 else -1.0
     elif fil.signed == 0:
@@ -334,7 +341,7 @@ def speed_rows(fil, bank, work, h, row):
     h_row[i_l] = -sign * a
     h_row[i_e] = share
     innovation = speed - sign * (v - x[i_l] * a) - share * x[i_e]
-    evidence = robust_row(x, P_sqrt, h_row, innovation, sigma * sigma, f, keep, move)
+    credit(bank, h, BY_SPEED, robust_row(x, P_sqrt, h_row, innovation, sigma * sigma, f, keep, move))
     h_row[i_v] = 0.0
     h_row[i_l] = 0.0
     h_row[i_e] = 0.0
@@ -351,26 +358,28 @@ def speed_rows(fil, bank, work, h, row):
         bent = 0.5 * speed * BEND_CHANGE * variance_of(P_sqrt, i_s)
         h_row[i_s] = sign * speed * bend
         variance = sigma * sigma + floor * floor + bent * bent
-        evidence += robust_row(x, P_sqrt, h_row, across, variance, f, keep, move)
+        # tracks side by side differ in bearing by less than a model is wrong: only a turnout's leg is evidence
+        doubt = k[K_COURSE_DOUBT] + point[P_SIGMA_CROSS] / BLIND_LENGTH
+        doubt = project(P_sqrt, h_row, f) + variance + (speed * doubt) ** 2
+        credit(bank, h, BY_COURSE, -0.5 * (min(across * across / doubt, ROW_GATE) + math.log(doubt)))
+        robust_row(x, P_sqrt, h_row, across, variance, f, keep, move)
         h_row[i_s] = 0.0
-    return evidence
 
 
 @part
 def motion_rows(fil, net, shared, bank, work, h, row, dt, still):
-    """Odometer speed, standstill, yaw gyro, GNSS speed and course of one hypothesis, where they are there; gives ln p."""
+    """Odometer speed, standstill, yaw gyro, GNSS speed and course of one hypothesis, where they are there."""
     at = fil.at
     h_row = work.vector[W_H]
     for j in range(h_row.shape[0]):
         h_row[j] = 0.0
-    evidence = 0.0
     if row[WHEEL_SPEED] == row[WHEEL_SPEED] and at[ODOMETER_SCALE] >= 0:
-        evidence += wheel_speed_row(fil, bank, work, h, row)
+        credit(bank, h, BY_ODOMETER, wheel_speed_row(fil, bank, work, h, row))
     if still:
         i_v = at[SPEED]
         h_row[i_v] = 1.0
         variance = fil.settings[K_STILL_SIGMA] ** 2
-        evidence += robust_row(
+        rest = robust_row(
             bank.x[h],
             bank.P_sqrt[h],
             h_row,
@@ -380,12 +389,12 @@ def motion_rows(fil, net, shared, bank, work, h, row, dt, still):
             work.vector[W_KEEP],
             work.vector[W_MOVE],
         )
+        credit(bank, h, BY_STANDSTILL, rest)
         h_row[i_v] = 0.0
     if row[YAW_RATE] == row[YAW_RATE] and at[GYRO_BIAS] >= 0 and dt > 0.0:
-        evidence += gyro_row(fil, net, bank, work, h, row, dt)
+        credit(bank, h, BY_YAW, gyro_row(fil, net, bank, work, h, row, dt))
     if row[GNSS_SPEED] == row[GNSS_SPEED] and at[SPEED_LATENCY] >= 0 and shared.common[C_SPEED_STALE] == 0.0:
-        evidence += speed_rows(fil, bank, work, h, row)
-    return evidence
+        speed_rows(fil, bank, work, h, row)
 
 
 @part
@@ -463,11 +472,15 @@ def position_row(fil, net, shared, bank, work, h, row):
     h_north[i_fn] = 1.0
     fix[0] = row[EAST] - at_east - h_east[i_g] * x[i_g] - x[i_fe]
     fix[1] = row[NORTH] - at_north - h_north[i_g + 1] * x[i_g + 1] - x[i_fn]
+    i_m = at[MAP_CROSS]
+    if i_m >= 0:  # the track lies to the right of where the model has it
+        across = point[P_SIGMA_CROSS] / math.hypot(point[P_D_EAST], point[P_D_NORTH])
+        h_east[i_m] = across * point[P_D_NORTH]
+        h_north[i_m] = -across * point[P_D_EAST]
+        fix[0] -= h_east[i_m] * x[i_m]
+        fix[1] -= h_north[i_m] * x[i_m]
     fix[2] = (k[K_WHITE] * row[SIGMA_EAST]) ** 2 + extra_east
     fix[3] = (k[K_WHITE] * row[SIGMA_NORTH]) ** 2 + extra_north
-    unsure = max(point[P_SIGMA_CROSS] ** 2 - k[K_MODEL] ** 2, 0.0)  # beyond what the frame's sigma holds already
-    fix[2] += unsure
-    fix[3] += unsure
     s_ee = project(P_sqrt, h_east, f_east) + fix[2]
     s_nn = project(P_sqrt, h_north, f_north) + fix[3]
     s_en = 0.0
