@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from railnav.errors import CrsError, InputError, RailnavError
+from railnav.errors import CrsError, InputError
 from railnav.geodesy.grid import frame_for_grid
 from railnav.io.design import (
     ARC,
@@ -37,14 +37,15 @@ from railnav.io.design import (
     integrate,
 )
 from railnav.io.junctions import Design, join_designs
+from railnav.io.xml_document import children as _children
+from railnav.io.xml_document import local_name as _local
+from railnav.io.xml_document import read_document
 from railnav.track.elements import Gradients
 from railnav.track.model import TrackModel
 from railnav.units import wrap_angle
 
 FloatArray = NDArray[np.float64]
 
-#: A larger file is refused: it is read as a whole.
-MAX_LANDXML_BYTES = 256 * 1024**2
 #: Stations that agree within this are one, m.
 SAME_STATION = 0.01
 #: Cant whose station lies further than this outside the plan is said, m.
@@ -190,50 +191,8 @@ def read_landxml(path: str | Path, *, crs: Any = None, spacing: float = 1.0) -> 
 
 
 def _document(path: Path) -> Any:
-    """Root of the file, parsed without entities, network or document types."""
-    try:
-        from lxml import etree
-    except ImportError as error:
-        raise RailnavError('LandXML needs lxml; install with: pip install "railnav[network]"') from error
-    try:
-        if path.is_dir():
-            raise InputError("is a folder", file=path, remedy="name a LandXML file")
-        size = path.stat().st_size
-        if size > MAX_LANDXML_BYTES:
-            raise InputError(
-                f"is {size / 1e6:.0f} MB; LandXML up to {MAX_LANDXML_BYTES / 1e6:.0f} MB is read",
-                file=path,
-                remedy="export the alignments alone, without surfaces",
-            )
-        data = path.read_bytes()
-    except FileNotFoundError as error:
-        raise InputError("does not exist", file=path, remedy="check the name") from error
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise InputError(f"cannot be read ({reason})", file=path) from error
-    typed = any(
-        word.encode(code) in data for word in ("<!DOCTYPE", "<!ENTITY") for code in ("utf-8", "utf-16-le", "utf-16-be")
-    )
-    parser = etree.XMLParser(
-        resolve_entities=False,
-        no_network=True,
-        load_dtd=False,
-        dtd_validation=False,
-        huge_tree=False,
-        remove_comments=True,
-        remove_pis=True,
-    )
-    try:
-        root = None if typed else etree.fromstring(data, parser)
-    except (etree.XMLSyntaxError, ValueError) as error:
-        cause = " ".join(str(error).split())
-        raise InputError(f"is no XML ({cause})", file=path, remedy="export it again; it may be cut short") from error
-    if root is None or root.getroottree().docinfo.internalDTD is not None:
-        raise InputError(
-            "has a document type, which may hold entities",
-            file=path,
-            remedy="remove <!DOCTYPE ...>; LandXML needs none",
-        )
+    """Root of the file."""
+    root = read_document(path, what="LandXML", too_large="export the alignments alone, without surfaces")
     if _local(root) != "LandXML":
         raise InputError(f"is XML of the kind {_local(root)!r}, not LandXML", file=path, remedy="export LandXML 1.2")
     version = str(root.get("version", "1.2"))
@@ -262,15 +221,6 @@ def _features(node: Any) -> dict[str, str]:
         if feature.get("code") == "railnav"
         for item in _children(feature, "Property")
     }
-
-
-def _local(node: Any) -> str:
-    """Name of an element without its namespace; empty for what is no element."""
-    return node.tag.rpartition("}")[2] if isinstance(node.tag, str) else ""
-
-
-def _children(node: Any, *names: str) -> list[Any]:
-    return [child for child in node if _local(child) in names]
 
 
 def _direction_unit(root: Any, path: Path) -> str:
