@@ -268,7 +268,7 @@ def _bands(recording: Recording, channels: dict[str, Channel], refused: dict[str
             if not fine:
                 best = min(of.spacing for of, _ in present)
                 refused[key] = (
-                    f"sampled each {best:.1f} m; {band.name} begins at waves of {band.lower:g} m and takes {band.lower / SAMPLES_A_WAVE:.1f} m"
+                    f"sampled each {best:.1f} m; {band.name}, waves from {band.lower:g} m, takes {band.lower / SAMPLES_A_WAVE:.1f} m"
                 )
                 continue
             of, times = min(fine, key=lambda pair: band_noise(pair[0].noise, pair[0].spacing, band, integrate=pair[1]))

@@ -33,6 +33,8 @@ KINDS = ("alignment", "longitudinal_level", "cross_level", "gauge")
 STEP = 0.25
 #: Fields fade in and out over this length at the ends of a track, m.
 FADE = 25.0
+#: Wavelength beyond which the spectrum of each field levels off, m.
+LONGEST = (305.0, 305.0, 60.0, 60.0)
 _DEGREE = math.pi / 180.0
 
 #: Recording car: survey GNSS, attitude at 200 Hz to 0.002 degrees, gauge and cant at 200 Hz to 0.3 mm, odometer.
@@ -112,8 +114,8 @@ def irregular(
 ) -> Irregularities:
     """Make fields of irregularities over all tracks of a model.
 
-    The spectrum falls as 1 / ((f^2 + fr^2)(f^2 + fc^2)) with 2 pi fr = 0.0206 and 2 pi fc = 0.8246 rad/m: its shape is that
-    of the ERRI B176 spectra (recalled, not read); its size is set here.
+    The spectrum falls as 1 / ((f^2 + fr^2)(f^2 + fc^2)) with 2 pi fc = 0.8246 rad/m and 1 / fr of `LONGEST`: the
+    shape of the ERRI B176 spectra (recalled, not read; there 1 / fr is 305 m for all); its size is set here.
 
     Parameters
     ----------
@@ -149,7 +151,7 @@ def irregular(
         block = fields[start[i] : start[i + 1]]
         for k, sigma in enumerate(wanted):
             if sigma > 0.0:
-                block[:, k] = sigma * _coloured(generator, len(block))
+                block[:, k] = sigma * _coloured(generator, len(block), LONGEST[k])
         s = STEP * np.arange(len(block))
         end = np.minimum(s, s[-1] - s) / min(FADE, max(s[-1] / 2.0, STEP))
         block *= np.square(np.sin(0.5 * np.pi * np.clip(end, 0.0, 1.0)))[:, None]
@@ -165,13 +167,13 @@ def irregular(
     return Irregularities(model, start, fields)
 
 
-def _coloured(generator: np.random.Generator, count: int) -> FloatArray:
+def _coloured(generator: np.random.Generator, count: int, longest: float) -> FloatArray:
     """A row with the spectrum of track, of standard deviation 1 in waves of 3 to 25 m."""
     from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 
     size = next_fast_len(max(count, 64) + round(400.0 / STEP), real=True)
     omega = 2.0 * np.pi * rfftfreq(size, STEP)
-    shape = 1.0 / np.sqrt((omega**2 + 0.0206**2) * (omega**2 + 0.8246**2))
+    shape = 1.0 / np.sqrt((omega**2 + (2.0 * np.pi / longest) ** 2) * (omega**2 + 0.8246**2))
     shape *= 1.0 / np.sqrt(1.0 + (omega * 1.5 / (2.0 * np.pi)) ** 8)  # nothing shorter than 1.5 m
     shape[0] = 0.0
     in_band = (omega >= 2.0 * np.pi / 25.0) & (omega <= 2.0 * np.pi / 3.0)

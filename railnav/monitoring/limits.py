@@ -1,0 +1,371 @@
+"""Limits and quality: where a channel is beyond its limits, how it spreads over 200 m, and which class that is.
+
+Limits come from an editable table (`railnav.io.limits`); each value carries its source and whether it was read there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railnav.errors import TrackError
+from railnav.monitoring.channels import Channel, Geometry
+from railnav.monitoring.filters import stretches
+
+FloatArray = NDArray[np.float64]
+
+#: Levels of action, mildest first.
+LEVELS = ("alert", "intervention", "immediate")
+#: Names of quality classes, best first.
+CLASSES = "ABCDE"
+#: A channel is judged where its sigma is at most this share of the mildest limit.
+FINE_ENOUGH = 1.0 / 3.0
+#: Stretches beyond a limit, of one sign and nearer than this, are one defect, m.
+ONE_DEFECT = 2.0
+#: Length over which standard deviations are taken, m, and the share of it that must be known.
+SEGMENT, KNOWN = 200.0, 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """Limits of one channel in a range of speeds.
+
+    Attributes
+    ----------
+    channel : str
+        Key of the channel.
+    speed : (float, float)
+        Above, up to, m/s.
+    radius : (float, float)
+        From, below, m: of the model's curve.
+    levels : mapping of str to (float, float)
+        By level: low (negative) and high, in the channel's SI unit; from nominal for gauge.
+    status : str
+        "read", "recalled" or "own".
+    source : str
+    """
+
+    channel: str
+    speed: tuple[float, float]
+    radius: tuple[float, float]
+    levels: Mapping[str, tuple[float, float]]
+    status: str
+    source: str
+
+    @property
+    def mildest(self) -> str:
+        """The mildest level that the table states."""
+        return next(level for level in LEVELS if level in self.levels)
+
+
+@dataclass(frozen=True, slots=True)
+class ClassLimit:
+    """Upper limits of the quality classes of a standard deviation over 200 m, m, best class first."""
+
+    channel: str
+    speed: tuple[float, float]
+    limits: tuple[float, ...]
+    status: str
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class LimitTable:
+    """A table of limits.
+
+    Attributes
+    ----------
+    name : str
+    gauge : float
+        Nominal gauge that it is for, m; NaN for any.
+    limits : tuple of Limit
+    deviations : tuple of Limit
+        Of standard deviations over 200 m.
+    classes : tuple of ClassLimit
+    """
+
+    name: str
+    gauge: float
+    limits: tuple[Limit, ...]
+    deviations: tuple[Limit, ...]
+    classes: tuple[ClassLimit, ...]
+
+    @property
+    def recalled(self) -> int:
+        """How many entries were recalled rather than read."""
+        status = [limit.status for limit in (*self.limits, *self.deviations)] + [limit.status for limit in self.classes]
+        return status.count("recalled")
+
+
+@dataclass(frozen=True, slots=True)
+class Exceedance:
+    """One place where a channel is beyond a limit.
+
+    Attributes
+    ----------
+    channel, title, unit : str
+    level : str
+        The severest level reached: "alert", "intervention" or "immediate".
+    value, limit : float
+        The extreme value (gauge: from nominal) and the limit of that level, SI.
+    start, finish, peak : float
+        Distances along the section: beyond the mildest limit from start to finish, the extreme at peak, m.
+    track : str
+    offset, chainage : float
+        Of the extreme, m; chainage NaN where the model has no posts.
+    easting, northing : float
+        Of the extreme, on the model's axis, m.
+    status, source : str
+        Of the limit.
+    run : str
+    """
+
+    channel: str
+    title: str
+    unit: str
+    level: str
+    value: float
+    limit: float
+    start: float
+    finish: float
+    peak: float
+    track: str
+    offset: float
+    chainage: float
+    easting: float
+    northing: float
+    status: str
+    source: str
+    run: str
+
+    @property
+    def length(self) -> float:
+        """Length beyond the mildest limit, m."""
+        return self.finish - self.start
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether a channel was judged, and if not, why: `reason` is empty where it was."""
+
+    channel: str
+    title: str
+    sigma: float
+    mildest: float
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Segment:
+    """Standard deviation of one channel over one segment of a section.
+
+    Attributes
+    ----------
+    channel : str
+    start, finish : float
+        Distance along the section, m.
+    track : str
+        At the middle.
+    chainage : float
+        At the middle, m.
+    deviation : float
+        Standard deviation about the segment's mean, m.
+    grade : str
+        Class A to E, or empty where the table has none.
+    alert : float
+        Alert limit of the standard deviation, m; NaN where the table has none.
+    """
+
+    channel: str
+    start: float
+    finish: float
+    track: str
+    chainage: float
+    deviation: float
+    grade: str
+    alert: float
+
+
+def exceedances(geometry: Geometry, table: LimitTable, speed: float) -> tuple[list[Exceedance], list[Verdict]]:
+    """Hold the channels of a run against limits.
+
+    Parameters
+    ----------
+    geometry : Geometry
+    table : LimitTable
+    speed : float
+        Speed of the line, m/s.
+
+    Returns
+    -------
+    list of Exceedance
+        Severest first, then along the section.
+    list of Verdict
+        One for each channel that the table limits or the run gives: judged, or why not. A channel whose sigma is over a third of its
+        mildest limit is not judged.
+    """
+    found: list[Exceedance] = []
+    verdicts: list[Verdict] = []
+    radius = 1.0 / np.maximum(np.abs(geometry.recording.passage.section.at(geometry.distance).curvature), 1e-9)
+    named = {limit.channel for limit in table.limits}
+    for key in (*geometry.channels, *sorted(named - set(geometry.channels))):
+        channel = geometry.channels.get(key)
+        title = channel.title if channel else key.replace("_", " ")
+        limits = [limit for limit in table.limits if limit.channel == key and _holds(limit.speed, speed)]
+        sigma = channel.sigma if channel else math.nan
+        if channel is None:
+            verdicts.append(Verdict(key, title, sigma, math.nan, geometry.refused.get(key, "not recorded")))
+            continue
+        if key not in named:
+            verdicts.append(Verdict(key, title, sigma, math.nan, "the table has no limit for it"))
+            continue
+        if not limits:
+            verdicts.append(Verdict(key, title, sigma, math.nan, f"the table has no limit at {3.6 * speed:.0f} km/h"))
+            continue
+        mildest = min(min(abs(v) for v in limit.levels[limit.mildest]) for limit in limits)
+        if not sigma <= FINE_ENOUGH * mildest:
+            verdicts.append(Verdict(key, title, sigma, mildest, "its noise is over a third of the mildest limit"))
+            continue
+        verdicts.append(Verdict(key, title, sigma, mildest, ""))
+        for limit in limits:
+            there = (radius >= limit.radius[0]) & (radius < limit.radius[1])
+            found += _beyond(geometry, channel, limit, there)
+    order = {level: i for i, level in enumerate(reversed(LEVELS))}
+    return sorted(found, key=lambda e: (order[e.level], e.peak)), verdicts
+
+
+def _holds(span: tuple[float, float], speed: float) -> bool:
+    return span[0] < speed <= span[1] + 1e-9
+
+
+def _beyond(geometry: Geometry, channel: Channel, limit: Limit, there: NDArray[np.bool_]) -> list[Exceedance]:
+    """The places of one channel beyond one limit."""
+    section, distance = geometry.recording.passage.section, geometry.distance
+    nominal = geometry.recording.gauge_nominal if channel.key == "gauge" else 0.0
+    x = channel.values - nominal
+    found = []
+    low, high = limit.levels[limit.mildest]
+    for sign, edge in ((1.0, high), (-1.0, -low)):
+        over = there & (sign * x > edge)
+        for a, b in _joined(stretches(over), round(ONE_DEFECT / geometry.recording.step)):
+            k = a + int(np.nanargmax(sign * x[a:b]))
+            reached = [
+                level
+                for level in LEVELS
+                if level in limit.levels and sign * x[k] > sign * limit.levels[level][1 if sign > 0 else 0]
+            ]
+            bound = limit.levels[reached[-1]][1 if sign > 0 else 0]
+            track, offset = section.locate(distance[k])
+            point = section.at(distance[k])
+            found.append(
+                Exceedance(
+                    channel=channel.key,
+                    title=channel.title,
+                    unit=channel.unit,
+                    level=reached[-1],
+                    value=float(x[k]),
+                    limit=float(bound),
+                    start=float(distance[a]),
+                    finish=float(distance[b - 1]),
+                    peak=float(distance[k]),
+                    track=section.model.track_id[int(track)],
+                    offset=float(offset),
+                    chainage=float(point.chainage),
+                    easting=float(point.easting),
+                    northing=float(point.northing),
+                    status=limit.status,
+                    source=limit.source,
+                    run=geometry.recording.run.id,
+                )
+            )
+    return found
+
+
+def _joined(parts: list[tuple[int, int]], within: int) -> list[tuple[int, int]]:
+    out: list[tuple[int, int]] = []
+    for a, b in parts:
+        if out and a - out[-1][1] <= within:
+            out[-1] = (out[-1][0], b)
+        else:
+            out.append((a, b))
+    return out
+
+
+def segments(geometry: Geometry, table: LimitTable, speed: float, *, length: float = SEGMENT) -> list[Segment]:
+    """Standard deviations of the channels over segments of a section, with class and alert limit.
+
+    Parameters
+    ----------
+    geometry : Geometry
+    table : LimitTable
+    speed : float
+        Speed of the line, m/s.
+    length : float
+        Of a segment, m.
+
+    Returns
+    -------
+    list of Segment
+        Of the banded channels; a segment of which less than half is known is left out.
+    """
+    section, step = geometry.recording.passage.section, geometry.recording.step
+    n = round(length / step)
+    count = len(geometry.distance) // n
+    out: list[Segment] = []
+    middle = (np.arange(count) + 0.5) * length
+    track, _ = section.locate(middle)
+    chainage = section.at(middle).chainage if count else middle
+    for channel in geometry.channels.values():
+        if channel.band is None:
+            continue
+        deviation = deviations(channel.values, n)
+        classes = [c for c in table.classes if c.channel == channel.key and _holds(c.speed, speed)]
+        alert = [d for d in table.deviations if d.channel == channel.key and _holds(d.speed, speed)]
+        out += [
+            Segment(
+                channel=channel.key,
+                start=float(i * length),
+                finish=float((i + 1) * length),
+                track=section.model.track_id[int(track[i])],
+                chainage=float(chainage[i]),
+                deviation=float(deviation[i]),
+                grade=grade(float(deviation[i]), classes[0]) if classes else "",
+                alert=alert[0].levels["alert"][1] if alert and "alert" in alert[0].levels else math.nan,
+            )
+            for i in np.flatnonzero(np.isfinite(deviation))
+        ]
+    return out
+
+
+def deviations(values: FloatArray, count: int) -> FloatArray:
+    """Standard deviation of each whole block of samples about its mean; NaN where less than half is known.
+
+    Examples
+    --------
+    >>> deviations(np.array([1.0, -1.0, 1.0, -1.0, np.nan, np.nan, np.nan, 2.0]), 4)
+    array([ 1., nan])
+    """
+    if count < 2:
+        raise TrackError(f"a standard deviation of {count} samples is none")
+    blocks = values[: len(values) // count * count].reshape(-1, count)
+    known = np.isfinite(blocks)
+    n = known.sum(axis=1)
+    filled = np.where(known, blocks, 0.0)
+    mean = filled.sum(axis=1) / np.maximum(n, 1)
+    square = np.where(known, (blocks - mean[:, None]) ** 2, 0.0).sum(axis=1) / np.maximum(n, 1)
+    return np.where(n >= KNOWN * count, np.sqrt(square), np.nan)
+
+
+def grade(deviation: float, limits: ClassLimit) -> str:
+    """Class of a standard deviation: the first whose upper limit it does not pass.
+
+    Examples
+    --------
+    >>> grade(0.9e-3, ClassLimit("longitudinal_level_d1", (0.0, 40.0), (0.75e-3, 1.1e-3, 1.8e-3, 2.5e-3), "read", ""))
+    'B'
+    """
+    return CLASSES[int(np.searchsorted(limits.limits, deviation, side="left"))]
