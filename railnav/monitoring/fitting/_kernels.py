@@ -19,7 +19,9 @@ _W = 0.5 * np.polynomial.legendre.leggauss(4)[1]
 
 
 @njit(cache=True)
-def _reset(x, P, old, new, order, prior, states):  # x (states + 1,), P alike; numbers of live states -> cost, changed in place
+def _reset(
+    x, P, old, new, order, prior, states
+):  # x (states + 1,), P alike; numbers of live states -> cost, changed in place
     """Pass from one kind of element to another: what is continuous stays, what jumps is drawn anew, eq (6)."""
     cost = 0.0
     size = states + 1
@@ -354,7 +356,9 @@ def lay(kind, length, k0, k1, sway, east, north, bearing, owner, s, here, slopes
 
 
 @njit(cache=True)
-def advance(owner, s, length, step):  # (n,) element and place in it, (m,) lengths, (n,) steps: owner and s changed in place
+def advance(
+    owner, s, length, step
+):  # (n,) element and place in it, (m,) lengths, (n,) steps: owner and s changed in place
     """Move feet along the elements; the first and last element go on straight past their ends."""
     last = len(length) - 1
     for i in range(len(s)):

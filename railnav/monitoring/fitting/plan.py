@@ -226,9 +226,7 @@ def fit_plan(
     along = chain.edges[owner] + s
     start = chain.start.copy()
     start[:, :2] += origin
-    return PlanFit(
-        replace(chain, start=start), residual, along, robust, cost, settled, rows, _factor(kkt), sigma
-    )
+    return PlanFit(replace(chain, start=start), residual, along, robust, cost, settled, rows, _factor(kkt), sigma)
 
 
 # --- within -----------------------------------------------------------------------------------------------------------

@@ -103,8 +103,6 @@ def reference(along: FloatArray, east: FloatArray, north: FloatArray, window: fl
         The curve's points, its bearing and its curvature, m, rad, 1/m.
     """
     n = len(along)
-    x = np.empty((n, 2))
-    d = np.empty((n, 2))
     points = np.column_stack([east, north])
     origin = points.mean(axis=0)
     points = points - origin
@@ -114,7 +112,6 @@ def reference(along: FloatArray, east: FloatArray, north: FloatArray, window: fl
     short = last - first < 5
     first = np.where(short, np.clip(np.arange(n) - 2, 0, max(n - 5, 0)), first)
     last = np.where(short, np.minimum(first + 5, n), last)
-    # sums of powers by differences of running sums, in coordinates of each window's middle would lose digits: loop by lag instead
     most = int((last - first).max())
     sums = np.zeros((n, 5))
     rhs = np.zeros((n, 3, 2))
@@ -164,7 +161,7 @@ def segment_plan(
     curvature_scale, rate_scale : float
         What curvatures (1/m) and their changes along the track (1/m^2) are like.
     """
-    ref_e, ref_n, bearing, bend = reference(along, east, north, window)
+    ref_e, ref_n, bearing, _ = reference(along, east, north, window)
     sin, cos = np.sin(bearing), np.cos(bearing)
     y = (east - ref_e) * cos - (north - ref_n) * sin
     step_e, step_n = np.diff(ref_e), np.diff(ref_n)
@@ -189,7 +186,9 @@ def segment_plan(
     )
 
 
-def segment_profile(along: FloatArray, height: FloatArray, noise: Noise, *, every: float = 0.0, bend_scale: float) -> Pieces:
+def segment_profile(
+    along: FloatArray, height: FloatArray, noise: Noise, *, every: float = 0.0, bend_scale: float
+) -> Pieces:
     """Pieces of a profile: grades, and vertical curves whose slope changes evenly, `bend_scale` a metre (1/m)."""
     zero = np.zeros(len(along) - 1)
     start = height - height[0]

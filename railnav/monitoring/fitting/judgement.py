@@ -1,0 +1,214 @@
+"""Which elements the points speak for: fewer where they do not, and which law a transition follows.
+
+Segmentation finds elements, the adjustment tells how sure each is. An arc whose curvature is none within its sigma is a straight, a
+transition shorter than its sigma is none, and what is the same on both sides of it becomes one. Laws of transitions are tried one
+after another on all of them; the one that fits best counts, and another only where the points insist.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railnav.monitoring.fitting.plan import Chain, PlanFit
+from railnav.track import elements
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+#: A value within this many sigmas of nothing is nothing.
+NOTHING = 3.0
+#: A transition is none within this many sigmas of its length.
+_NO_LENGTH = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One element: its kind, length, curvatures, start, and whether curvature passes on from the one before."""
+
+    kind: int
+    length: float
+    k0: float
+    k1: float
+    start: tuple[float, float, float]
+    smooth: bool
+    sway: float = 0.0
+
+
+def items_of(chain: Chain) -> list[Item]:
+    """Elements of a chain one by one."""
+    rows = zip(chain.kind.tolist(), chain.length.tolist(), chain.k0.tolist(), chain.k1.tolist(), strict=True)
+    return [
+        Item(
+            kind,
+            length,
+            k0,
+            k1,
+            (float(chain.start[j, 0]), float(chain.start[j, 1]), float(chain.start[j, 2])),
+            j > 0 and bool(chain.first[j] == chain.last[j - 1]),
+            float(chain.sway[j]),
+        )
+        for j, (kind, length, k0, k1) in enumerate(rows)
+    ]
+
+
+def chain_of(items: list[Item]) -> Chain:
+    """Elements tied together: arcs have one curvature, transitions take those of their neighbours."""
+    m = len(items)
+    first, last = np.full(m, -1), np.full(m, -1)
+    values: list[float] = []
+
+    def new(value: float) -> int:
+        values.append(value)
+        return len(values) - 1
+
+    for j, item in enumerate(items):
+        if item.kind == elements.ARC:
+            first[j] = last[j] = new(item.k0)
+    for j, item in enumerate(items):
+        if item.kind < elements.CLOTHOID:
+            continue
+        if item.smooth and j > 0:
+            first[j] = last[j - 1]
+        else:
+            first[j] = new(item.k0)
+        follows = j + 1 < m and items[j + 1].smooth
+        if follows and items[j + 1].kind < elements.CLOTHOID:
+            last[j] = first[j + 1]
+        elif follows and item.k1 == 0.0 and items[j + 1].k0 == 0.0:
+            last[j] = -1  # a point of inflection
+        else:
+            last[j] = new(item.k1)
+    return Chain(
+        np.array([item.kind for item in items], np.int64),
+        np.array([item.length for item in items]),
+        first,
+        last,
+        np.array(values),
+        np.array([item.start for item in items]),
+        np.array([item.sway for item in items]),
+    )
+
+
+def split_inflections(items: list[Item]) -> list[Item]:
+    """Transitions that bend both ways, cut where they are straight."""
+    from railnav.track.elements import Plan, integrate
+
+    out: list[Item] = []
+    for item in items:
+        if item.kind < elements.CLOTHOID or not item.k0 * item.k1 < 0.0:
+            out.append(item)
+            continue
+        share = item.k0 / (item.k0 - item.k1)
+        before, after = share * item.length, (1.0 - share) * item.length
+        if min(before, after) < 0.5:  # next to nothing on one side
+            k0, k1 = (0.0, item.k1) if before < after else (item.k0, 0.0)
+            out.append(replace(item, k0=k0, k1=k1, smooth=item.smooth and k0 != 0.0))
+            continue
+        one = np.array([0.0])
+        plan = Plan(
+            one + before,
+            np.array([elements.CLOTHOID]),
+            one + item.k0,
+            one,
+            one + item.start[0],
+            one + item.start[1],
+            one + item.start[2],
+            one,
+        )
+        point, bearing = integrate(plan, np.array([before]))
+        out.append(replace(item, length=before, k1=0.0))
+        start = (float(point[0, 0]), float(point[0, 1]), float(bearing[0]))
+        out.append(replace(item, length=after, k0=0.0, start=start, smooth=True))
+    return out
+
+
+def simplify(items: list[Item], bend_sigma: FloatArray, length_sigma: FloatArray) -> list[Item]:
+    """Elements without those that the points do not speak for.
+
+    Parameters
+    ----------
+    items : list of Item
+    bend_sigma : (m,) array
+        Of arcs' curvatures, 1/m.
+    length_sigma : (m,) array
+        m.
+    """
+    work = list(items)
+    for j, item in enumerate(work):
+        if item.kind == elements.ARC and abs(item.k0) < NOTHING * bend_sigma[j]:
+            work[j] = replace(item, kind=elements.STRAIGHT, k0=0.0, k1=0.0)
+            if j > 0 and work[j - 1].kind >= elements.CLOTHOID and item.smooth:
+                work[j - 1] = replace(work[j - 1], k1=0.0)
+            if j + 1 < len(work) and work[j + 1].kind >= elements.CLOTHOID and work[j + 1].smooth:
+                work[j + 1] = replace(work[j + 1], k0=0.0)
+    sigma = list(zip(bend_sigma.tolist(), length_sigma.tolist(), strict=True))
+    changed = True
+    while changed and len(work) > 1:
+        changed = False
+        for j in range(len(work)):
+            item = work[j]
+            before = work[j - 1] if j > 0 else None
+            after = work[j + 1] if j + 1 < len(work) else None
+            if before is not None and _same(before, item, sigma[j - 1][0], sigma[j][0]):
+                work[j - 1] = replace(before, length=before.length + item.length)
+                del work[j], sigma[j]
+                changed = True
+                break
+            if item.kind >= elements.CLOTHOID and before is not None and after is not None:
+                plain = before.kind < elements.CLOTHOID and after.kind < elements.CLOTHOID
+                if plain and _same(before, after, sigma[j - 1][0], sigma[j + 1][0]):
+                    work[j - 1] = replace(before, length=before.length + item.length + after.length)
+                    del work[j : j + 2], sigma[j : j + 2]
+                    changed = True
+                    break
+                if plain and item.length < _NO_LENGTH * sigma[j][1]:
+                    half = 0.5 * item.length
+                    work[j - 1] = replace(before, length=before.length + half)
+                    work[j + 1] = replace(after, length=after.length + half, smooth=False, start=_back(after, half))
+                    del work[j], sigma[j]
+                    changed = True
+                    break
+            short = item.length < _NO_LENGTH * sigma[j][1]
+            if item.kind < elements.CLOTHOID and short and before is not None and after is not None:
+                turning = before.kind >= elements.CLOTHOID and after.kind >= elements.CLOTHOID
+                if turning and item.smooth and after.smooth:
+                    half = 0.5 * item.length
+                    work[j - 1] = replace(before, length=before.length + half)
+                    work[j + 1] = replace(after, length=after.length + half, start=_back(after, half))
+                    del work[j], sigma[j]
+                    changed = True
+                    break
+    return work
+
+
+def _back(item: Item, by: float) -> tuple[float, float, float]:
+    east, north, bearing = item.start
+    return east - by * float(np.sin(bearing)), north - by * float(np.cos(bearing)), bearing - by * item.k0
+
+
+def _same(a: Item, b: Item, sigma_a: float, sigma_b: float) -> bool:
+    """Whether two plain elements are one."""
+    if a.kind == b.kind == elements.STRAIGHT:
+        return True
+    if a.kind == b.kind == elements.ARC:
+        return abs(a.k0 - b.k0) < NOTHING * float(np.hypot(sigma_a, sigma_b))
+    return False
+
+
+def with_law(chain: Chain, law: int | IntArray) -> Chain:
+    """The chain with another law of its transitions: one for all, or (m,) one an element."""
+    kind = np.where(chain.kind >= elements.CLOTHOID, law, chain.kind)
+    between = (kind == elements.CUBIC) & (chain.first >= 0) & (chain.last >= 0)
+    return replace(chain, kind=np.where(between, elements.CLOTHOID, kind).astype(np.int64))
+
+
+def evidence_by_transition(fit: PlanFit, reach: float = 0.5) -> FloatArray:
+    """Weighted squares of the points on each element and `reach` of its length on both sides, (m,)."""
+    square = np.append(0.0, np.cumsum(fit.weight * (fit.residual / fit.sigma) ** 2))
+    edges = fit.chain.edges
+    low = np.searchsorted(fit.along, edges[:-1] - reach * fit.chain.length)
+    high = np.searchsorted(fit.along, edges[1:] + reach * fit.chain.length)
+    return np.asarray(square[high] - square[low])
