@@ -20,6 +20,8 @@ FASTEST_TURN = 3.0
 FROZEN_TIME = 1.0
 #: A gap is an interval longer than this many median intervals.
 GAP_FACTOR = 5.0
+#: Accelerometers that scatter less than this are still, m/s^2; then no gyro scatters more than this, rad/s.
+STILL_FORCE, NOISIEST_GYRO = 0.5, 0.03
 _CHANNELS = ("rate x", "rate y", "rate z", "specific force x", "specific force y", "specific force z")
 
 
@@ -70,7 +72,8 @@ def inspect_log(time: ArrayLike, rate_ib_b: ArrayLike, specific_force_b: ArrayLi
     Rules. Clock: a time that does not increase. Gap: above five median intervals. Frozen: a channel that never changes, or holds one value
     for a second and 50 samples while its usual step is shorter. Saturated: an extreme value held for three samples or more, over eight
     robust sigmas from the median. Unit: a median specific force of 1 (g), 1000 (mg) or 981 (Gal), rates that no land vehicle reaches
-    (degrees). Axes: gravity mostly on another axis than down. A log of degrees at rest looks like a poor gyro: it is not recognised.
+    (degrees), or rates that scatter by 1.7 deg/s while the accelerometers are still. Axes: gravity mostly on another axis than
+    down. Degrees per second of a very quiet gyro at rest are not recognised.
 
     Examples
     --------
@@ -105,7 +108,29 @@ def inspect_log(time: ArrayLike, rate_ib_b: ArrayLike, specific_force_b: ArrayLi
                 "they are in degrees per second; multiply them by pi/180",
             )
         )
+    elif turning.size and np.any(good) and not any(one.kind == "unit" for one in found):
+        found += _degrees_at_rest(w, f)
     return tuple(found)
+
+
+def _degrees_at_rest(w: FloatArray, f: FloatArray) -> list[Finding]:
+    """Rates that scatter as no gyro does while the accelerometers are still."""
+    both = np.isfinite(f).all(axis=1) & np.isfinite(w).all(axis=1)
+    if np.sum(both) < 50 or float(f[both].std(axis=0).max()) > STILL_FORCE:
+        return []
+    scatter = float(np.median(np.diff(w[both], axis=0).std(axis=0))) / math.sqrt(2.0)
+    if scatter <= NOISIEST_GYRO:
+        return []
+    return [
+        Finding(
+            "unit",
+            "rate",
+            0,
+            int(np.sum(both)),
+            f"the rates scatter by {scatter:.3f} rad/s from sample to sample while the accelerometers are still, as no gyro does: they are "
+            "in degrees per second; multiply them by pi/180",
+        )
+    ]
 
 
 def _clock(t: FloatArray) -> list[Finding]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +21,8 @@ REST_RATE = math.radians(0.5)
 
 #: A base whose specific force scatters more than this between pieces of a log does not rest, m/s^2.
 REST_FORCE = 0.05
+#: A base that turns evenly faster than this turns; slower, it is the bias of a gyro at rest, rad/s.
+TURNING = math.radians(15.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,3 +130,152 @@ def rest(
         )
     root = math.sqrt(pieces)
     return Rest(w.mean(axis=0), f.mean(axis=0), w_piece.std(axis=0, ddof=1) / root, scatter / root, len(w) * interval)
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """A stretch of a log in which its means stay what they are.
+
+    Attributes
+    ----------
+    first, last : int
+        Samples, the last not included.
+    begin, end : float
+        Times of the first and of the last sample of it, s.
+    turning : bool
+        Whether it turns evenly, faster than `TURNING`, rather than rest.
+    """
+
+    first: int
+    last: int
+    begin: float
+    end: float
+    turning: bool
+
+    @property
+    def duration(self) -> float:
+        """Of the stretch, s."""
+        return self.end - self.begin
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """What keeps a log from counting as rest, at its worst.
+
+    Attributes
+    ----------
+    rate, rate_time : float
+        Largest change of the angular rate from one piece to the next, rad/s, and when, s.
+    force, force_time : float
+        Largest change of the specific force, m/s^2, and when, s.
+    """
+
+    rate: float
+    rate_time: float
+    force: float
+    force_time: float
+
+
+def find_stretches(
+    time: ArrayLike,
+    rate_ib_b: ArrayLike,
+    specific_force_b: ArrayLike,
+    *,
+    shortest: float = 2.0,
+    by_rate: bool = False,
+    largest_rate: float = REST_RATE,
+    largest_change: float = REST_FORCE,
+) -> tuple[tuple[Stretch, ...], Motion]:
+    """Stretches of a log at rest, or turning evenly, and the evidence of motion between them.
+
+    The log is cut into pieces of an eighth of `shortest` (at least five samples, at most half a second); a stretch goes on as long as the
+    mean of the next piece agrees with the mean of the stretch. Beside motion one piece is left out on each side.
+
+    Parameters
+    ----------
+    time : (n,) array
+        s, increasing; a gap ends a stretch.
+    rate_ib_b, specific_force_b : (n, 3) array
+        rad/s and m/s^2.
+    shortest : float, optional
+        A stretch that is shorter does not count, s.
+    by_rate : bool, optional
+        Look at the rates only: on a rate table whose axis is not vertical the specific force turns along.
+    largest_rate, largest_change : float, optional
+        How far a piece may lie from the mean of its stretch, rad/s (or half a percent of the rate, if that is more) and m/s^2.
+
+    Returns
+    -------
+    stretches : tuple of Stretch
+    motion : Motion
+        Over the whole log.
+
+    Raises
+    ------
+    ValueError
+        Shapes that do not fit, fewer than 20 samples, values that are not finite.
+
+    Notes
+    -----
+    A vehicle that runs evenly on a straight track looks at rest to its inertial sensors; only wheels or GNSS tell.
+
+    Examples
+    --------
+    >>> force = np.repeat([[0.0, 0.0, -9.8], [0.0, 9.8, 0.0]], 1000, axis=0)
+    >>> found, _ = find_stretches(np.arange(2000) * 0.01, np.zeros((2000, 3)), force)
+    >>> [(s.begin, round(s.end, 2)) for s in found]
+    [(0.0, 9.74), (10.25, 19.99)]
+    """
+    t = np.asarray(time, dtype=np.float64)
+    w, f = (np.asarray(v, dtype=np.float64) for v in (rate_ib_b, specific_force_b))
+    if t.ndim != 1 or w.shape != (len(t), 3) or w.shape != f.shape or len(t) < 20:
+        raise ValueError(
+            f"needs times (n,), rates and specific forces (n, 3), n at least 20, not {t.shape}, {w.shape}, {f.shape}"
+        )
+    if not (np.isfinite(t).all() and np.isfinite(w).all() and np.isfinite(f).all()):
+        raise ValueError("a time, rate or specific force is not finite; cut the log there")
+    if not (math.isfinite(shortest) and shortest > 0.0):
+        raise ValueError(f"shortest is {shortest}; it must be positive")
+    step = float(np.median(np.diff(t)))
+    size = max(5, round(min(0.5, shortest / 8.0) / step))
+    pieces = []  # first sample of each piece, gaps between pieces, never within
+    for part in np.split(np.arange(len(t)), np.flatnonzero(np.diff(t) > 5.0 * step) + 1):
+        pieces += [part[k : k + size] for k in range(0, len(part) - size + 1, size)]
+    if len(pieces) < 2:
+        raise ValueError("the log is shorter than two pieces; record for longer")
+    W, F = (np.array([x[piece].mean(axis=0) for piece in pieces]) for x in (w, f))
+    joined = [b[0] == a[-1] + 1 for a, b in pairwise(pieces)]
+    turn, jerk = np.linalg.norm(np.diff(W, axis=0), axis=1), np.linalg.norm(np.diff(F, axis=0), axis=1)
+    a, b = int(np.argmax(turn)), int(np.argmax(jerk))
+    motion = Motion(float(turn[a]), float(t[pieces[a + 1][0]]), float(jerk[b]), float(t[pieces[b + 1][0]]))
+    found = []
+    k = 0
+    while k < len(pieces):
+        last = k + 1
+        sum_w, sum_f = W[k].copy(), F[k].copy()
+        while last < len(pieces) and joined[last - 1]:
+            mean_w = sum_w / (last - k)
+            allowed = max(largest_rate, 0.005 * float(np.linalg.norm(mean_w)))
+            if np.linalg.norm(W[last] - mean_w) > allowed:
+                break
+            if not by_rate and np.linalg.norm(F[last] - sum_f / (last - k)) > largest_change:
+                break
+            sum_w += W[last]
+            sum_f += F[last]
+            last += 1
+        inner = k if k == 0 or not joined[k - 1] else k + 1
+        outer = last if last == len(pieces) or not joined[last - 1] else last - 1
+        if outer > inner:
+            begin, end = int(pieces[inner][0]), int(pieces[outer - 1][-1])
+            if t[end] - t[begin] + step >= shortest:
+                found.append(
+                    Stretch(
+                        begin,
+                        end + 1,
+                        float(t[begin]),
+                        float(t[end]),
+                        bool(np.linalg.norm(sum_w / (last - k)) > TURNING),
+                    )
+                )
+        k = last
+    return tuple(found), motion

@@ -327,7 +327,12 @@ class SensorGrade:
 _TABLES = "tables 4 to 9 of the source, spec/inertial.md B2"
 _STIM300 = "manufacturer's sheet as quoted by NavToolkit, navtk::filtering::stim300_model (is4s.github.io/NavToolkit), 10 g range"
 
-#: Data-sheet figures by name. The ASM330LHH is left out: no citable source of its noise was found.
+_ASM330 = (
+    "noise, accelerometer bias and scale from the defaults of github.com/rsonawane2002/My_IMU (asm330lhh.py), a simulator, worse end of "
+    "its ranges: the maker's table was not at hand; ranges from docs.rs/asm330lhhx-rs; switch-on bias of the gyro of 1 deg/s is assumed"
+)
+
+#: Data-sheet figures by name.
 GRADES: dict[str, SensorGrade] = {
     g.name: g
     for g in (
@@ -416,6 +421,27 @@ GRADES: dict[str, SensorGrade] = {
             random_walk=0.06 * _SPEED_PER_ROOT_HOUR,
             scale=300e-6,
             cross_axis=1e-3,
+        ),
+        SensorGrade(
+            "ASM330LHH gyroscope",
+            "gyroscope",
+            _ASM330,
+            full_scale=125.0 * _DEGREE,
+            quantum=125.0 / 2**15 * _DEGREE,
+            bias=1.0 * _DEGREE,
+            instability=4.0 * _DEGREE_PER_HOUR,
+            random_walk=5e-3 * _DEGREE,
+            scale=1e-3,
+        ),
+        SensorGrade(
+            "ASM330LHH accelerometer",
+            "accelerometer",
+            _ASM330,
+            full_scale=2.0 * STANDARD_GRAVITY,
+            quantum=2.0 / 2**15 * STANDARD_GRAVITY,
+            bias=15.0 * _MILLI_G,
+            random_walk=0.12 * _MILLI_G,
+            scale=3e-3,
         ),
     )
 }

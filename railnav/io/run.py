@@ -192,6 +192,18 @@ def read_run(folder: str | Path, *, report: Callable[[LogSummary], None] | None 
     )
 
 
+def read_imu_table(path: str | Path) -> ImuStream:
+    """Read a table of inertial samples on its own, .csv or .parquet with the columns of an `imu` stream.
+
+    Raises
+    ------
+    RunError
+        The table is missing or malformed: with the row and the column.
+    """
+    table = read_table(path, _COLUMNS["imu"], error=RunError)
+    return _imu(table, _time(table, 0.0), _Imu(file=str(path)), Path(path).parent)
+
+
 def write_run(run: Run, folder: str | Path, *, truth: Truth | None = None) -> None:
     """Write a run folder: `run.toml`, one CSV file a stream, and `truth.csv` where there is truth.
 
