@@ -9,7 +9,18 @@ ends at their time, as in `railnav.run.ImuStream`.
 from __future__ import annotations
 
 from railnav.inertial.advice import advise_positions
-from railnav.inertial.aiding import Fixes, Ranges, Rests, VehicleMotion, find_rests, without_lever_arm
+from railnav.inertial.aided import (
+    AidedSolution,
+    Fixes,
+    Ranges,
+    Rests,
+    Unknowns,
+    Vehicle,
+    VehicleMotion,
+    find_rests,
+    integrate,
+    without_lever_arm,
+)
 from railnav.inertial.alignment import Alignment, coarse_align, level, lever_arm_motion
 from railnav.inertial.allan import AllanCurve, NoiseParameters, allan_deviation, fit_allan
 from railnav.inertial.autonomous import (
@@ -49,7 +60,6 @@ from railnav.inertial.great_circle import (
 )
 from railnav.inertial.heading import VelocityHeading, heading_from_antennas, heading_from_velocity
 from railnav.inertial.inspection import Finding, inspect_log
-from railnav.inertial.integration import AidedSolution, Unknowns, Vehicle, integrate
 from railnav.inertial.loose import ImuNoise, InitialSigma, LooseSolution, integrate_gnss
 from railnav.inertial.mechanization import (
     EARTH_RATE,

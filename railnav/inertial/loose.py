@@ -182,8 +182,8 @@ def integrate_gnss(
     array([1., 1., 1.])
     """
     from railnav.estimation._kernels import triangularize_rows
-    from railnav.inertial.aiding import Fixes
-    from railnav.inertial.integration import Vehicle, integrate
+    from railnav.inertial.aided.aiding import Fixes
+    from railnav.inertial.aided.integration import Vehicle, integrate
 
     arm = np.asarray(lever_arm_b, dtype=np.float64)
     if arm.shape != (3,) or not np.isfinite(arm).all():

@@ -164,12 +164,12 @@ def find_rests(
     rate_ib_b, specific_force_b : (n, 3) array
         rad/s, m/s^2.
     window : float, optional
-        s; only its first half before an instant that moves again counts, as windows end at their instant.
+        s; windows end at their instant.
     every : float, optional
         Step between the instants given, s.
     rate_spread, force_spread : float, optional
-        Largest standard deviation, root of the sum over axes, of a rest, rad/s and m/s^2. Default: twice the tenth smallest percent of
-        the log's windows, which needs a log that rests somewhere and moves elsewhere: otherwise an empty `Rests`.
+        Largest standard deviation, root of the sum over axes, of a rest, rad/s and m/s^2. Default: twice that of the
+        quietest windows of the log, which needs one that rests somewhere and moves elsewhere: otherwise an empty `Rests`.
     sigma_velocity : float, optional
         m/s.
 
@@ -216,11 +216,10 @@ def find_rests(
     full = count > 0.5 * np.median(count)
     limits = []
     for given, s in zip((rate_spread, force_spread), spread, strict=True):
-        quiet = 2.0 * float(np.percentile(s[full], 0.1))
-        if given is None and quiet > 0.5 * float(np.median(s[full])):
-            return Rests(np.empty(0), np.empty((0, 3)), sigma_velocity)
-        limits.append(quiet if given is None else given)
+        limits.append(2.0 * float(np.percentile(s[full], 0.1)) if given is None else given)
     still = full & (spread[0] < limits[0]) & (spread[1] < limits[1])
+    if (rate_spread is None or force_spread is None) and still.sum() > 0.9 * full.sum():
+        return Rests(np.empty(0), np.empty((0, 3)), sigma_velocity)
     noise = float(np.median(spread[0][still])) / np.sqrt(3.0) if still.any() else 1e-3
     sigma_rate = max(noise / np.sqrt(max(float(np.median(count)), 1.0)) * 3.0, 1e-6)
     return Rests(ends[still], mean_w[still], sigma_velocity, sigma_rate)

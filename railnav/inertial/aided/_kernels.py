@@ -21,7 +21,7 @@ ANTENNA, AXLE, MOUNTING, TIME, ODOMETER, CLOCK, GYRO_SCALE, FORCE_SCALE, GYRO_BI
 #: Kinds of measurement.
 FIX, BODY, REST, RANGE = range(4)
 #: Length over which the acceleration that carries a fix to its sample is averaged, s.
-ACCELERATION_TIME = 0.1
+ACCELERATION_TIME = 0.03
 
 
 @njit(cache=True, error_model="numpy")
@@ -237,7 +237,6 @@ def innovations(kind, data, age, state, parameter, at, nine, nominal, turn, h, a
         H[1, att], H[1, att + 2] = ld, -ln
         H[2, att], H[2, att + 1] = le, -ln
         H[3, vel], H[4, vel + 1], H[5, vel + 2] = 1.0, 1.0, 1.0
-        H[0, vel], H[1, vel + 1], H[2, vel + 2] = late, late, -late
         H[3, att + 1], H[3, att + 2] = -sd, se
         H[4, att], H[4, att + 2] = sd, -sn
         H[5, att], H[5, att + 1] = -se, sn
@@ -253,6 +252,10 @@ def innovations(kind, data, age, state, parameter, at, nine, nominal, turn, h, a
                 H[3 + a, g] = -(C[a, 1] * wz - C[a, 2] * wy)
                 H[3 + a, g + 1] = -(C[a, 2] * wx - C[a, 0] * wz)
                 H[3 + a, g + 2] = -(C[a, 0] * wy - C[a, 1] * wx)
+        for i in range(H.shape[1]):  # the way between fix and sample
+            H[0, i] += late * H[3, i]
+            H[1, i] += late * H[4, i]
+            H[2, i] -= late * H[5, i]
         if at[TIME] >= 0:
             g = at[TIME]
             H[0, g], H[1, g], H[2, g] = -vn, -ve, vd
@@ -343,9 +346,10 @@ def innovations(kind, data, age, state, parameter, at, nine, nominal, turn, h, a
         le = C[1, 0] * lx + C[1, 1] * ly + C[1, 2] * lz
         ld = C[2, 0] * lx + C[2, 1] * ly + C[2, 2] * lz
         sx, sy, sz = wy * lz - wz * ly, wz * lx - wx * lz, wx * ly - wy * lx
-        vn = state[3] + C[0, 0] * sx + C[0, 1] * sy + C[0, 2] * sz
-        ve = state[4] + C[1, 0] * sx + C[1, 1] * sy + C[1, 2] * sz
-        vd = state[5] + C[2, 0] * sx + C[2, 1] * sy + C[2, 2] * sz
+        sn = C[0, 0] * sx + C[0, 1] * sy + C[0, 2] * sz
+        se = C[1, 0] * sx + C[1, 1] * sy + C[1, 2] * sz
+        sd = C[2, 0] * sx + C[2, 1] * sy + C[2, 2] * sz
+        vn, ve, vd = state[3] + sn, state[4] + se, state[5] + sd
         # antenna in Earth axes at the instant of the measurement; rows of C_en: north, east, down
         ln, le, ld = ln - vn * age, le - ve * age, ld - vd * age
         x = (across + state[2]) * cl * co - sl * co * ln - so * le - cl * co * ld
@@ -365,6 +369,12 @@ def innovations(kind, data, age, state, parameter, at, nine, nominal, turn, h, a
         H[0, att], H[0, att + 1], H[0, att + 2] = ue * ld - ud * le, ud * ln - un * ld, un * le - ue * ln
         H[0, g + 1] = -1.0
         H[1, vel], H[1, vel + 1], H[1, vel + 2] = un, ue, ud
+        H[1, att], H[1, att + 1], H[1, att + 2] = ue * sd - ud * se, ud * sn - un * sd, un * se - ue * sn
+        for a in range(3):
+            u = un if a == 0 else (ue if a == 1 else ud)
+            H[1, bg] += u * (C[a, 2] * ly - C[a, 1] * lz)
+            H[1, bg + 1] += u * (C[a, 0] * lz - C[a, 2] * lx)
+            H[1, bg + 2] += u * (C[a, 1] * lx - C[a, 0] * ly)
         H[1, g] = -1.0
 
 
