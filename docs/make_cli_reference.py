@@ -45,6 +45,19 @@ def reference() -> str:
             "",
             *_options(command),
         ]
+        if isinstance(command, click.Group):
+            for name, part in command.commands.items():
+                words = f"{verb} {name}"
+                lines += [
+                    "",
+                    f"### railnav {words}",
+                    "",
+                    f"    {_usage(words, part)}",
+                    "",
+                    _words(part),
+                    "",
+                    *_options(part),
+                ]
     return "\n".join(lines).rstrip() + "\n"
 
 

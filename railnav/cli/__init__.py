@@ -26,6 +26,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "simulate": ("simulate", "Simulate a run over a model, with its truth."),
     "info": ("info", "Describe a model, a run or a solution."),
     "validate": ("validate", "Check a model or a run and report every defect at once."),
+    "datum": ("datum", "List datums, compare and pin their transformations, and fit one to common points."),
     "convert": ("convert", "Write a model or a solution in another format."),
     "view": ("view", "Draw a model or a solution as a picture or a page."),
 }

@@ -60,7 +60,7 @@ def crs_options(function: F) -> F:
         ),
         click.option(
             "--crs",
-            help="Plane: an EPSG code, WKT, or gk3 or gk6 for the Gauss-Krueger zone that fits.  [default: gk6]",
+            help="Plane: an EPSG code, WKT, a frame file (.toml), or gk3 or gk6 for the Gauss-Krueger zone that fits.  [default: gk6]",
         ),
     ):
         function = option(function)
@@ -93,4 +93,10 @@ def frame_request(crs: str | None, zone_width: str | None, ellipsoid: str | None
         raise click.UsageError("--zone-width and --ellipsoid shape a Gauss-Krueger zone; --crs names another plane")
     if named and named.isdigit():
         named = f"EPSG:{named}"
-    return {"crs": named, "zone_width": int(zone_width or 6), "ellipsoid": ellipsoid or "wgs84"}
+    plane: Any = named
+    if named and ".toml" in named.lower():
+        from railnav.io.frame_file import names_frame_file, read_frame
+
+        if names_frame_file(named):
+            plane = read_frame(named)
+    return {"crs": plane, "zone_width": int(zone_width or 6), "ellipsoid": ellipsoid or "wgs84"}

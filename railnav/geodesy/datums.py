@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from railnav.errors import CrsError
+from railnav.geodesy.ellipsoid import BESSEL, GRS80, GSK2011, KRASSOWSKY, PZ90, WGS84, Ellipsoid
 from railnav.geodesy.helmert import Helmert
 from railnav.geodesy.plates import SIGMA_RATE, plate_at, plate_motion
 
@@ -48,6 +49,11 @@ class Datum:
     moving: bool
     codes: tuple[int, ...] = ()
     aliases: tuple[str, ...] = ()
+
+    @property
+    def figure(self) -> Ellipsoid:
+        """Its ellipsoid."""
+        return _FIGURES[self.ellipsoid]
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +115,8 @@ class DatumShift:
 
 _KRASSOWSKY, _BESSEL, _GRS80 = "ellps=krass", "ellps=bessel", "ellps=GRS80"
 _WGS84, _PZ90, _GSK = "ellps=WGS84", "a=6378136 rf=298.257839303", "a=6378136.5 rf=298.2564151"
+
+_FIGURES = {_KRASSOWSKY: KRASSOWSKY, _BESSEL: BESSEL, _GRS80: GRS80, _WGS84: WGS84, _PZ90: PZ90, _GSK: GSK2011}
 
 _ALL = (
     Datum("ITRF2000", _GRS80, True, (8997, 7909, 4919), ("WGS84G1150",)),
@@ -411,7 +419,8 @@ def datum_shift(
         variance += (SIGMA_RATE * (to - now)) ** 2
         now = to
 
-    for link, backwards in _path(a.name, b.name):
+    path = _path(a.name, b.name)
+    for i, (link, backwards) in enumerate(path):
         start, end = (link.target, link.source) if backwards else (link.source, link.target)
         if DATUMS[start].moving and now is None and (link.epoch is not None or link.shift.moves):
             raise CrsError(f"coordinates in {a.name} change by 2 to 3 cm a year; give their epoch")
@@ -425,6 +434,8 @@ def datum_shift(
         variance += link.accuracy**2
         if not DATUMS[end].moving:
             now = None
+        elif link.epoch is not None and target_epoch is not None and all(k.epoch is None for k, _ in path[i + 1 :]):
+            carry(target_epoch)  # at once, so that the way back takes the same steps
     if b.moving and target_epoch is not None:
         if now is None:
             raise CrsError(f"coordinates in {a.name} change by 2 to 3 cm a year; give their epoch")

@@ -122,7 +122,7 @@ def choose_frame(
                 raise CrsError(f"{crs.name} is pinned already; leave out operation={operation!r}")
             _refuse_distorted(crs, extent, crs.name, crs.name)
             return crs
-        return _pin(_read_crs(crs), extent, asked=str(crs), operation=operation)
+        return _pin(read_plane(crs), extent, asked=str(crs), operation=operation)
     if operation is not None:
         raise CrsError(f"operation={operation!r} goes with crs=; name the plane")
     if kind == "wgs84":
@@ -130,7 +130,7 @@ def choose_frame(
     if kind.startswith("krass"):
         return _pulkovo(extent, zone_width)
     code = _db_ref(extent, zone_width)
-    return _pin(_read_crs(f"EPSG:{code}"), extent, asked=f"EPSG:{code}")
+    return _pin(read_plane(f"EPSG:{code}"), extent, asked=f"EPSG:{code}")
 
 
 def frame_for_grid(easting: ArrayLike, northing: ArrayLike, *, crs: Any, operation: str | None = None) -> GridFrame:
@@ -180,7 +180,7 @@ def frame_for_grid(easting: ArrayLike, northing: ArrayLike, *, crs: Any, operati
             )
         system = _gauss_krueger_wgs84(float(6 * zone - 3 if width == 6 else 3 * zone), width)
     else:
-        system = _read_crs(crs)
+        system = read_plane(crs)
     plain = system.source_crs if system.is_bound and system.source_crs is not None else system
     # the datum's own latitude and longitude: within some 200 m of those of WGS 84, near enough to choose by
     proj = Proj(plain)
@@ -273,7 +273,7 @@ def _db_ref(extent: Extent, zone_width: int) -> int:
     return 5680 + zone
 
 
-def _read_crs(crs: Any) -> pyproj.CRS:
+def read_plane(crs: Any) -> pyproj.CRS:
     """Any user input as a projected system in metres, east and north; or say why not."""
     from pyproj import CRS
     from pyproj.exceptions import CRSError as ProjError
@@ -347,7 +347,7 @@ def chained(system: pyproj.CRS, extent: Extent, label: str) -> tuple[str, str, f
     companion = stand_in(datum)
     latitude, longitude = np.radians([extent.south, extent.north]), np.radians([extent.west, extent.east])
     shift = datum_shift(companion, datum.name, latitude, longitude, target_epoch=2011.0 if datum.moving else None)
-    return _through(system, shift.proj, label), f"WGS 84 as {companion}; {shift.operation}", shift.accuracy
+    return pipeline_through(system, shift.proj, label), f"WGS 84 as {companion}; {shift.operation}", shift.accuracy
 
 
 def _by_code(system: pyproj.CRS, extent: Extent, label: str, code: str) -> tuple[str, str, float] | None:
@@ -370,10 +370,10 @@ def _by_code(system: pyproj.CRS, extent: Extent, label: str, code: str) -> tuple
             raise CrsError(f"{code} ({found.name}) does not hold about {extent}; choose another")
     backwards = found.source == base.name
     words = f"{'Inverse of ' if backwards else ''}{found.name}"
-    return _through(system, found.shift.step(inverse=backwards), label), words, found.accuracy
+    return pipeline_through(system, found.shift.step(inverse=backwards), label), words, found.accuracy
 
 
-def _through(system: pyproj.CRS, steps: str, label: str) -> str:
+def pipeline_through(system: pyproj.CRS, steps: str, label: str) -> str:
     """The pipeline from WGS 84 by geocentric steps to a projected system."""
     from pyproj import CRS, Transformer
 

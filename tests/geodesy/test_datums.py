@@ -332,7 +332,7 @@ def test_there_and_back(source, target, there, back):
     home = datum_shift(target, source, *place, epoch=back, target_epoch=there if DATUMS[source].moving else None)
     x = xyz("Moscow")
     y = forth.apply(x)
-    np.testing.assert_allclose(home.apply(y), x, atol=2e-3 if DATUMS[source].moving else 2e-6)
+    np.testing.assert_allclose(home.apply(y), x, atol=1e-6)
     if forth.proj:
         np.testing.assert_allclose(proj_of(forth.proj).transform(*x), y, atol=3e-3)
 
