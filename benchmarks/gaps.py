@@ -1,4 +1,4 @@
-"""Gaps cut into the real runs of line 80: GNSS alone, no odometer, no IMU; where is the train when the fixes come back?
+"""Gaps cut into the real runs of line 80, GNSS alone, no odometer, no IMU: where the train is when the fixes come back.
 
     python benchmarks/gaps.py [--trains 8]
 
@@ -52,7 +52,7 @@ def ends_of_gaps(run: Run, cut_run: Run, gap: float) -> list[tuple[float, float]
 
 
 def one(model: rn.TrackModel, run: Run, gap: float) -> tuple[list[float], list[float], list[float], list[bool], int]:
-    """Errors along at the ends of gaps, stated sigmas, the baseline's errors, whether inside the bound, and changes of track inside gaps."""
+    """At the ends of gaps: errors along, stated sigmas, the baseline's errors, whether inside the bound; and changes of track inside."""
     reference = rn.navigate(run, model, smooth=True)
     short = cut(run, gap)
     found = rn.navigate(short, model)
@@ -62,7 +62,7 @@ def one(model: rn.TrackModel, run: Run, gap: float) -> tuple[list[float], list[f
         j = int(np.argmin(np.abs(reference.time - found.time[i])))
         if found.track[i] < 0 or reference.track[j] < 0 or abs(reference.time[j] - found.time[i]) > 0.6:
             continue
-        along = _along(model, found, i, reference, j)
+        along = _along(found, i, reference, j)
         if along is None:
             continue
         errors.append(along)
@@ -80,7 +80,7 @@ def _run_between(solution: rn.Solution, a: int, b: int) -> float:
     return float(np.nansum(step))
 
 
-def _along(model: rn.TrackModel, found: rn.Solution, i: int, reference: rn.Solution, j: int) -> float | None:
+def _along(found: rn.Solution, i: int, reference: rn.Solution, j: int) -> float | None:
     """Difference along the track, m: positive ahead. A parallel track is the same place along."""
     dt = found.time[i] - reference.time[j]
     east, north = found.easting[i] - reference.easting[j], found.northing[i] - reference.northing[j]
@@ -114,9 +114,9 @@ def main() -> None:
     for (gap, kind), parts in sorted(total.items()):
         e, s, n, within = np.concatenate(parts, axis=1)
         print(
-            f"{gap:.0f} s gaps, {kind}: {len(e)} gaps; at their end {np.sqrt(np.mean(e**2)):.2f} m RMS, median {np.median(np.abs(e)):.2f} m, 95 % "
-            f"{np.quantile(np.abs(e), 0.95):.1f} m; stated sigma {np.sqrt(np.mean(s**2)):.2f} m, within 2 sigma {np.mean(np.abs(e) < 2 * s):.1%}, within "
-            f"the bound {np.mean(within):.2%}; constant speed {np.sqrt(np.mean(n**2)):.2f} m RMS"
+            f"{gap:.0f} s gaps, {kind}: {len(e)} gaps; at their end {np.sqrt(np.mean(e**2)):.2f} m RMS, median {np.median(np.abs(e)):.2f} m, "
+            f"95 % {np.quantile(np.abs(e), 0.95):.1f} m; stated sigma {np.sqrt(np.mean(s**2)):.2f} m, within 2 sigma {np.mean(np.abs(e) < 2 * s):.1%}, "
+            f"within the bound {np.mean(within):.2%}; constant speed {np.sqrt(np.mean(n**2)):.2f} m RMS"
         )
 
 

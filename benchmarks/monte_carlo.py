@@ -215,7 +215,7 @@ def parallel(line: TrackModel, scale: float) -> dict[str, Any]:
     parts, decided, sure_rows, wrong_rows, wrong_runs, count = [], [], 0, 0, 0, max(6, int(300 * scale))
     for seed in range(count):
         track = ("77R-03", "77L-03")[seed % 2]
-        run, truth = simulate(
+        run, _ = simulate(
             line, Leg((track,), start=300.0, finish=6300.0), seed=500 + seed, outfit=SERVICE, tunnels=False
         )
         solution = rn.navigate(run, line)
@@ -235,7 +235,8 @@ def parallel(line: TrackModel, scale: float) -> dict[str, Any]:
     print("  stated probability   epochs  independent   stated    right   95 % bounds")
     for c in together.classes:
         print(
-            f"  {c.low:8.3f} to {c.high:5.3f} {c.rows:9d} {c.effective:12.0f} {c.stated:8.4f} {c.right:8.4f}   {c.lower:.4f} to {c.upper:.4f}"
+            f"  {c.low:8.3f} to {c.high:5.3f} {c.rows:9d} {c.effective:12.0f} {c.stated:8.4f} {c.right:8.4f}   "
+            f"{c.lower:.4f} to {c.upper:.4f}"
         )
     print(f"  honest in every class: {'yes' if together.honest else 'NO'}")
     return {"runs": count, "wrong_runs": wrong_runs, "median_s": q50, "honest": together.honest}
@@ -263,8 +264,8 @@ def after_turnout(line: TrackModel, scale: float) -> dict[str, Any]:
         )
         wrong_sure += bool((sure & ~c.right).any())
     print(
-        f"parallel tracks after a crossover run through with IMU: right {right / rows:.3%} of epochs (bar 99.9 %), declared {sure_rows / rows:.1%}, "
-        f"ever sure of the wrong one in {share(wrong_sure, count)} of runs"
+        f"parallel tracks after a crossover run through with IMU: right {right / rows:.3%} of epochs (bar 99.9 %), "
+        f"declared {sure_rows / rows:.1%}, ever sure of the wrong one in {share(wrong_sure, count)} of runs"
     )
     return {"right": right / rows, "declared": sure_rows / rows, "runs": count}
 
