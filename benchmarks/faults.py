@@ -3,7 +3,8 @@
     python benchmarks/faults.py [--seeds 4]
 
 Five minutes on one track of the bundled double line, 4 m from the other, under open sky: 1 Hz GNSS with coloured errors, IMU,
-odometer. The fault begins after 130 s. Nobody owes a good position when sensors lie; the error ought to stay inside its bound, and no wrong track be declared.
+odometer. The fault begins after 130 s. Nobody owes a good position when sensors lie; the error ought to stay inside its bound, and
+no wrong track be declared.
 """
 
 from __future__ import annotations

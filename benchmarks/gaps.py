@@ -113,11 +113,13 @@ def main() -> None:
                 )
     for (gap, kind), parts in sorted(total.items()):
         e, s, n, within = np.concatenate(parts, axis=1)
-        print(
-            f"{gap:.0f} s gaps, {kind}: {len(e)} gaps; at their end {np.sqrt(np.mean(e**2)):.2f} m RMS, median {np.median(np.abs(e)):.2f} m, "
-            f"95 % {np.quantile(np.abs(e), 0.95):.1f} m; stated sigma {np.sqrt(np.mean(s**2)):.2f} m, within 2 sigma {np.mean(np.abs(e) < 2 * s):.1%}, "
-            f"within the bound {np.mean(within):.2%}; constant speed {np.sqrt(np.mean(n**2)):.2f} m RMS"
-        )
+        words = [
+            f"{gap:.0f} s gaps, {kind}: {len(e)} gaps; at their end {np.sqrt(np.mean(e**2)):.2f} m RMS",
+            f"median {np.median(np.abs(e)):.2f} m, 95 % {np.quantile(np.abs(e), 0.95):.1f} m",
+            f"stated sigma {np.sqrt(np.mean(s**2)):.2f} m, within 2 sigma {np.mean(np.abs(e) < 2 * s):.1%}",
+            f"within the bound {np.mean(within):.2%}; constant speed {np.sqrt(np.mean(n**2)):.2f} m RMS",
+        ]
+        print(", ".join(words))
 
 
 if __name__ == "__main__":
