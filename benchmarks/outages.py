@@ -38,12 +38,12 @@ DEGREE = np.pi / 180
 MOUNTING, DELAY, LEVER_ARM = (180.0, -6.79, 185.35), 0.125, (0.0, -0.05, 0.0)
 #: Start of the run, s of the day in UTC; GPS time is 18 s ahead.
 RUN_START, LEAP = 19 * 3600 + 34 * 60, 18
-NOISE = ImuNoise(3.0 * DEGREE / 60, 0.3 / 60, 200 * DEGREE / 3600, 0.01)
+NOISE = ImuNoise(5.0 * DEGREE / 60, 1.5 / 60, 250 * DEGREE / 3600, 0.015)
 INITIAL = InitialSigma(np.full(3, 0.1), np.full(3, 0.05), np.array([1.0, 1.0, 10.0]) * DEGREE, 0.3 * DEGREE, 0.15)
 SENSOR = {"time_offset": 0.1, "antenna_arm": 0.05, "gyro_scale": 0.01, "accelerometer_scale": 0.01}
 CAR = {"axle_arm": 1.0, "mounting": 2.0 * DEGREE}
 #: Steps between constraints, s; their sigma across and up, m/s; of GNSS positions, m, and velocities, m/s.
-STEP, SLIDE, POSITION, VELOCITY = 0.1, 0.1, 0.02, 0.09
+STEP, SLIDE, POSITION, VELOCITY = 0.1, 0.2, 0.03, 0.1
 #: Cut, period, s.
 CUTS = ((15.0, 45.0), (30.0, 60.0), (60.0, 120.0))
 #: Bars of the issue for the first of them, m.
