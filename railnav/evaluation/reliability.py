@@ -105,7 +105,7 @@ def reliability(
     Notes
     -----
     Rows one epoch apart repeat the same decision. The effective number of independent rows is estimated from the autocorrelation
-    of (right - stated) about zero, and shared among the classes by their rows.
+    of (right - stated) about zero, and shared among the classes by their rows, at least one to each.
 
     References
     ----------
@@ -134,7 +134,7 @@ def reliability(
         rows = int(inside.sum())
         if rows:
             classes.append(
-                _class(low, high, rows, rows * share, float(p[inside].mean()), float(hit[inside].mean()), confidence)
+                _class(low, high, rows, max(1.0, rows * share), float(p[inside].mean()), float(hit[inside].mean()), confidence)
             )
     return Reliability(tuple(classes), len(p), float((residual**2).mean()), confidence)
 
