@@ -23,6 +23,19 @@ VERBS: dict[str, tuple[str, str]] = {
     "build": ("build", "Build a reference track model from survey runs."),
     "navigate": ("navigate", "Place a run on a model: track, offset, speed, and how sure that is."),
     "evaluate": ("evaluate", "Compare a solution with the truth: errors along and across, track selection, integrity."),
+    "calibrate": (
+        "calibrate",
+        "Calibrate an inertial unit from positions: bias, scale and misalignment, with standard deviations.",
+    ),
+    "diagnose": ("diagnose", "Say whether an inertial unit is healthy, or which sensor failed and why."),
+    "align": (
+        "align",
+        "Align a standing vehicle: roll, pitch, gyrocompass heading and latitude, with confidence intervals.",
+    ),
+    "allan": (
+        "allan",
+        "Measure the noise of an inertial unit at rest: Allan deviation, drawn, and the parameters that explain it.",
+    ),
     "simulate": ("simulate", "Simulate a run over a model, with its truth."),
     "info": ("info", "Describe a model, a run or a solution."),
     "validate": ("validate", "Check a model or a run and report every defect at once."),

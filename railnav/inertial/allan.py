@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from railnav.errors import EstimationError
+from railnav.run import ImuStream
 
 FloatArray = NDArray[np.float64]
 
@@ -233,6 +234,95 @@ def fit_allan(
         sigma={k: v for k, v in sigma.items() if not math.isnan(v)},
         misfit=residual / math.sqrt(len(tau)),
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UnitNoise:
+    """Noise of the six channels of an inertial unit at rest.
+
+    Attributes
+    ----------
+    begin, end : float
+        The part of the log that was used, s.
+    interval : float
+        Sampling interval, s.
+    curves, fits : dict
+        By channel: "gyro x" to "accelerometer z".
+    """
+
+    begin: float
+    end: float
+    interval: float
+    curves: dict[str, AllanCurve]
+    fits: dict[str, NoiseParameters]
+
+
+def unit_noise(
+    imu: ImuStream,
+    *,
+    between: tuple[float, float] | None = None,
+    terms: tuple[str, ...] = ("random_walk", "bias_instability", "rate_random_walk"),
+) -> UnitNoise:
+    """Allan deviations and noise parameters of an inertial unit, over its longest rest.
+
+    Parameters
+    ----------
+    imu : ImuStream
+        Log.
+    between : (float, float), optional
+        Times instead of the longest rest, s.
+    terms : tuple of str, optional
+        See `fit_allan`.
+
+    Returns
+    -------
+    UnitNoise
+
+    Raises
+    ------
+    EstimationError
+        The log never rests (with the evidence), is too short, has gaps or a frozen axis.
+
+    Examples
+    --------
+    >>> noise = np.random.default_rng(1).normal(0.0, [1e-3], (3000, 6)) - [0.0, 0.0, 0.0, 0.0, 0.0, 9.81]
+    >>> found = unit_noise(ImuStream(np.arange(3000) * 0.01, noise[:, :3], noise[:, 3:]), terms=("random_walk",))
+    >>> round(found.fits["gyro x"].random_walk, 5)  # 1e-3 sqrt(0.01)
+    0.0001
+    """
+    from railnav.inertial.resting import find_stretches
+
+    if between is not None:
+        rows = slice(*np.searchsorted(imu.time, between, side="right").tolist())
+    else:
+        stretches, motion = find_stretches(imu.time, imu.gyro, imu.specific_force)
+        rests = [one for one in stretches if not one.turning]
+        if not rests:
+            raise EstimationError(
+                f"the log never rests: it turns by up to {math.degrees(motion.rate):.2f} deg/s and {motion.force:.2f} m/s^2 from piece to "
+                "piece; noise is measured at rest"
+            )
+        best = max(rests, key=lambda one: one.duration)
+        rows = slice(best.first, best.last)
+    time = imu.time[rows]
+    if len(time) < 64:
+        raise EstimationError(f"{len(time)} samples are too few for an Allan deviation; record for longer")
+    interval = float(np.median(np.diff(time)))
+    wide = np.diff(time) > 1.5 * interval
+    if wide.any():
+        raise EstimationError(
+            f"{int(wide.sum())} gaps, the first after {time[int(np.argmax(wide))]:.2f} s: an Allan deviation needs even samples; "
+            "take a part without"
+        )
+    curves: dict[str, AllanCurve] = {}
+    for what, x in (("gyro", imu.gyro[rows]), ("accelerometer", imu.specific_force[rows])):
+        for axis in range(3):
+            try:
+                curves[f"{what} {'xyz'[axis]}"] = allan_deviation(x[:, axis], interval)
+            except EstimationError as error:
+                raise EstimationError(f"{what} {'xyz'[axis]}: {error}") from error
+    fits = {name: fit_allan(curve, terms=terms) for name, curve in curves.items()}
+    return UnitNoise(float(time[0]), float(time[-1]), interval, curves, fits)
 
 
 def _markov(tau: FloatArray, T: float) -> FloatArray:

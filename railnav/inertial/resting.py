@@ -21,6 +21,8 @@ REST_RATE = math.radians(0.5)
 
 #: A base whose specific force scatters more than this between pieces of a log does not rest, m/s^2.
 REST_FORCE = 0.05
+#: Pieces of a stretch may differ by so many sigma of their noise.
+NOISE_SIGMAS = 4.5
 #: A base that turns evenly faster than this turns; slower, it is the bias of a gyro at rest, rad/s.
 TURNING = math.radians(15.0)
 
@@ -190,6 +192,7 @@ def find_stretches(
 
     The log is cut into pieces of an eighth of `shortest` (at least five samples, at most half a second); a stretch goes on as long as the
     mean of the next piece agrees with the mean of the stretch. Beside motion one piece is left out on each side.
+    White noise of the samples, as the quietest quarter of the pieces shows it, widens what is allowed, at most fourfold.
 
     Parameters
     ----------
@@ -248,6 +251,9 @@ def find_stretches(
     turn, jerk = np.linalg.norm(np.diff(W, axis=0), axis=1), np.linalg.norm(np.diff(F, axis=0), axis=1)
     a, b = int(np.argmax(turn)), int(np.argmax(jerk))
     motion = Motion(float(turn[a]), float(t[pieces[a + 1][0]]), float(jerk[b]), float(t[pieces[b + 1][0]]))
+    noise_w, noise_f = (_piece_noise(x, pieces, size) for x in (w, f))
+    allowed_f = min(math.hypot(largest_change, NOISE_SIGMAS * noise_f), 4.0 * largest_change)
+    least_w = min(math.hypot(largest_rate, NOISE_SIGMAS * noise_w), 4.0 * largest_rate)
     found = []
     k = 0
     while k < len(pieces):
@@ -255,10 +261,10 @@ def find_stretches(
         sum_w, sum_f = W[k].copy(), F[k].copy()
         while last < len(pieces) and joined[last - 1]:
             mean_w = sum_w / (last - k)
-            allowed = max(largest_rate, 0.005 * float(np.linalg.norm(mean_w)))
+            allowed = max(least_w, 0.005 * float(np.linalg.norm(mean_w)))
             if np.linalg.norm(W[last] - mean_w) > allowed:
                 break
-            if not by_rate and np.linalg.norm(F[last] - sum_f / (last - k)) > largest_change:
+            if not by_rate and np.linalg.norm(F[last] - sum_f / (last - k)) > allowed_f:
                 break
             sum_w += W[last]
             sum_f += F[last]
@@ -279,3 +285,9 @@ def find_stretches(
                 )
         k = last
     return tuple(found), motion
+
+
+def _piece_noise(x: FloatArray, pieces: list[NDArray[np.int64]], size: int) -> float:
+    """Sigma of the mean of a piece by white noise, all axes together, in the quietest quarter of the pieces."""
+    scatter = [float(np.linalg.norm(np.diff(x[piece], axis=0).std(axis=0))) for piece in pieces]
+    return float(np.percentile(scatter, 25.0)) / math.sqrt(2.0 * size)
