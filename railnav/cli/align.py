@@ -54,14 +54,13 @@ def command(
     Example:
       railnav align demo/service --unit IMU440
     """  # noqa: D301
-    from dataclasses import replace
     from math import degrees, radians
 
     from railnav.cli._terminal import print_facts, print_json, print_warnings
     from railnav.errors import EstimationError, InputError
     from railnav.inertial.sensors import GRADES
     from railnav.inertial.standing import INTERVAL_95, align_standing
-    from railnav.io.imu_calibration import calibrated_stream, read_calibration
+    from railnav.io.imu_calibration import calibrated_run, read_calibration
     from railnav.io.run import read_run
 
     window = _window(between) if between is not None else None
@@ -72,7 +71,7 @@ def command(
     force = 9.80665e-3 * accelerometer_bias if accelerometer_bias is not None else None
     if calibration is not None:
         known = read_calibration(calibration)
-        recorded = replace(recorded, imu=calibrated_stream(recorded.imu, calibration))
+        recorded = calibrated_run(recorded, calibration)
         gyro = known.gyro_bias_sigma() if gyro is None else gyro
         force = known.accelerometer_bias_sigma() if force is None else force
     if unit is not None:

@@ -21,8 +21,11 @@ from railnav.cli._verb import PATH, json_option
     show_default=True,
     help="Risk, per epoch, that the error exceeds the protection level.",
 )
+@click.option("--calibration", type=PATH, help="Calibration file of the IMU, .toml, where run.toml names none.")
 @json_option
-def command(run: Path, model: Path, output: Path, smooth: bool, integrity_risk: float, as_json: bool) -> None:
+def command(
+    run: Path, model: Path, output: Path, smooth: bool, integrity_risk: float, calibration: Path | None, as_json: bool
+) -> None:
     """Place a run on a model: track, offset, speed, and how sure that is.
 
     RUN is a folder with a run.toml. The solution has one row an epoch, with standard deviations, the protection level
@@ -36,11 +39,14 @@ def command(run: Path, model: Path, output: Path, smooth: bool, integrity_risk: 
     from railnav.cli._describe import describe_solution, print_solution
     from railnav.cli._terminal import print_json, progress
 
-    _files.check_output(output, _files.SOLUTION_ENDINGS, inputs=[model, *_files.members(run)])
+    _files.check_output(
+        output, _files.SOLUTION_ENDINGS, inputs=[model, *_files.members(run), *([calibration] if calibration else [])]
+    )
+    from railnav.io.imu_calibration import calibrated_run
     from railnav.io.run import read_run
     from railnav.navigation import navigate
 
-    recorded, reference = read_run(run), _files.read_model(model)
+    recorded, reference = calibrated_run(read_run(run), calibration), _files.read_model(model)
     with progress() as report:
         solution = navigate(recorded, reference, smooth=smooth, integrity_risk=integrity_risk, progress=report)
     solution.to_file(output)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,7 +25,7 @@ from railnav.inertial.imu_calibration import (
 )
 from railnav.inertial.temperature import TemperaturePolynomial
 from railnav.io.atomic import atomic_path
-from railnav.run import ImuStream
+from railnav.run import ImuStream, Run
 
 FloatArray = NDArray[np.float64]
 
@@ -232,6 +233,21 @@ def calibrated_stream(imu: ImuStream, file: str | Path) -> ImuStream:
         return apply_calibration(imu, read_calibration(file))
     except EstimationError as error:
         raise InputError(str(error), file=file) from error
+
+
+def calibrated_run(run: Run, file: str | Path | None) -> Run:
+    """Give a run with its IMU corrected by a calibration file; as it is where none is named.
+
+    Raises
+    ------
+    InputError
+        The run has no IMU, or the file is refused or does not fit.
+    """
+    if file is None:
+        return run
+    if run.imu is None:
+        raise InputError(f"the run {run.id} has no IMU to calibrate", file=file, remedy="name no calibration")
+    return replace(run, imu=calibrated_stream(run.imu, file))
 
 
 def calibration_text(calibration: ImuCalibration) -> str:
