@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     type=click.Choice(["L3G4200D", "IMU440", "RT3003", "STIM300"]),
     help="Another IMU, by its data sheet (L3G4200D: with the LSM303DLH).",
 )
+@click.option("--balises", is_flag=True, help="Carry a reader too: the model's balises are read as they are run over.")
 @click.option("--top-speed", type=click.FloatRange(1, 400), default=120.0, show_default=True, help="Top speed, km/h.")
 @click.option(
     "--outage",
@@ -67,6 +68,7 @@ def command(
     seed: int,
     grade: str,
     imu: str | None,
+    balises: bool,
     top_speed: float,
     outage: tuple[str, ...],
     fault: tuple[str, ...],
@@ -81,6 +83,8 @@ def command(
     Example:
       railnav simulate -m demo/bundled.gpkg -o run --route 77R-01,77R-13 --seed 7
     """  # noqa: D301
+    from dataclasses import replace
+
     from railnav.cli import _files
     from railnav.cli._describe import describe_run, print_run
     from railnav.cli._terminal import print_json, progress
@@ -90,19 +94,20 @@ def command(
     faults = [_fault(text) for text in fault]
     _files.check_output_folder(output)
     from railnav.io.run import write_run
-    from railnav.simulation import Driving, outfit_of, simulate, with_fault
+    from railnav.simulation import BaliseSensor, Driving, outfit_of, simulate, with_fault
 
     reference = _files.read_model(model)
     names = _names(route) if route is not None else ()
     if route is not None and not names:
         raise RailnavError("--route names no track")
+    outfit = outfit_of(grade, imu=imu)
     tracks = _way(reference, names) if names else _longest(reference)
     with progress() as tell:
         run, truth = simulate(
             reference,
             tracks,
             seed=seed,
-            outfit=outfit_of(grade, imu=imu),
+            outfit=replace(outfit, balise=BaliseSensor()) if balises else outfit,
             driving=Driving(speed=top_speed / 3.6),
             outages=outages,
             run_id=output.resolve().name,

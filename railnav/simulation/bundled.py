@@ -259,11 +259,21 @@ def demo_line(*, spacing: float = 1.0, frame: GridFrame | None = None) -> TrackM
             "simulated": True,
             "licence": "Apache-2.0",
             "tunnels": _tunnels(mains),
+            "balises": _balises([*(piece.section for piece in mains), branch]),
         },
     )
     kind = model.nodes.kind.copy()
     kind[model.end_node[model.track_index(branch.track_id)]] = NodeKind.BUFFER_STOP
     return replace(model, nodes=replace(model.nodes, kind=kind))
+
+
+def _balises(sections: list[TrackSection]) -> list[dict[str, Any]]:
+    """A balise every 1,500 m of each track of the main lines and the branch, from 400 m on."""
+    return [
+        {"id": f"B-{section.track_id}-{k + 1}", "track": section.track_id, "offset_m": float(offset)}
+        for section in sections
+        for k, offset in enumerate(np.arange(400.0, float(section.knots.offset[-1]) - 100.0, 1_500.0))
+    ]
 
 
 def _branch(placed: PlacedAxis, right: list[_Piece], spacing: float) -> TrackSection:

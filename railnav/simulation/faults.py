@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from railnav.errors import InputError
 from railnav.geodesy.ellipsoid import WGS84
-from railnav.run import GnssStream, ImuStream, OdometerStream, Run
+from railnav.run import BaliseStream, GnssStream, ImuStream, OdometerStream, Run
 from railnav.track.model import TrackModel
 from railnav.units import wrap_angle
 
@@ -43,7 +43,7 @@ class Fault:
     words : str
         What happens, in one line.
     subject : str
-        The stream concerned: "gnss", "odometer" or "imu".
+        The stream concerned: "gnss", "odometer", "imu" or "balise".
     expected : str
         What the navigator owes: "unharmed", "covered" or "flagged".
     duration : float
@@ -182,6 +182,8 @@ def _kept(stream: Any, rows: Any) -> Any:
         for name in stream.__slots__
         if isinstance(value := getattr(stream, name), np.ndarray) and value.ndim and len(value) == count
     }
+    if isinstance(stream, BaliseStream):
+        columns["id"] = tuple(np.array(stream.id, object)[rows].tolist())
     return replace(stream, **columns)
 
 
@@ -265,6 +267,12 @@ def _inertial(
         return replace(imu, **{which: value})
 
     return deed
+
+
+def _other_names(balise: BaliseStream, during: BoolArray, _: FloatArray, __: np.random.Generator) -> BaliseStream:
+    """Each balise read under the name of the next one of the run."""
+    names = (*balise.id[1:], balise.id[-1]) if balise.id else ()
+    return replace(balise, id=tuple(b if hit else a for a, b, hit in zip(balise.id, names, during, strict=True)))
 
 
 def _held(x: FloatArray, _: np.random.Generator) -> FloatArray:
@@ -370,6 +378,9 @@ _SENSOR_FAULTS: tuple[tuple[Fault, _Deed], ...] = (
     (Fault("imu-silent-60s", "no inertial samples for a minute", "imu", "unharmed", 60.0), _silent()),
     (Fault("imu-late-0.2s", "inertial stamps 0.2 s late", "imu", "covered", 60.0), _stamped_late(0.2)),
     (Fault("imu-mounted-aslant", "the IMU is turned by 5 degrees in yaw", "imu", "covered", _FOREVER, whole_run=True), _mounted_aslant),
+    (Fault("balise-silent", "the reader reads no further", "balise", "covered", _FOREVER), _silent()),
+    (Fault("balise-misnamed", "each balise is read under the name of the next", "balise", "covered", _FOREVER), _other_names),
+    (Fault("balise-late-1s", "readings 1 s late", "balise", "covered", _FOREVER), _stamped_late(1.0)),
 )
 # fmt: on
 

@@ -246,6 +246,25 @@ class GaugeSensor:
 
 
 @dataclass(frozen=True, slots=True)
+class BaliseSensor:
+    """A reader of balises, where the model lists them in `provenance["balises"]`.
+
+    Attributes
+    ----------
+    sigma : float
+        Sigma of the place along the track at which a balise is read, m.
+    missed : float
+        Probability that one is passed unread.
+    interval : float
+        Time between looks, s: stamps are exact to better than this.
+    """
+
+    sigma: float = 0.3
+    missed: float = 1e-3
+    interval: float = 0.05
+
+
+@dataclass(frozen=True, slots=True)
 class Outfit:
     """The sensors of one train; None for those it does not carry."""
 
@@ -255,6 +274,7 @@ class Outfit:
     odometer: OdometerSensor | None = None
     angles: AnglesSensor | None = None
     gauge: GaugeSensor | None = None
+    balise: BaliseSensor | None = None
 
 
 #: Survey car: carrier-phase GNSS of 2 cm, attitude, gauge and cant, calibrated odometer.

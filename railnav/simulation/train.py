@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from railnav.errors import TrackError
 from railnav.geodesy.ellipsoid import WGS84
 from railnav.run import (
+    BaliseStream,
     GaugeStream,
     GnssStream,
     GyroAnglesStream,
@@ -27,6 +28,7 @@ from railnav.simulation.journey import Leg, Path, path_of
 from railnav.simulation.sensors import (
     SERVICE,
     AnglesSensor,
+    BaliseSensor,
     GaugeSensor,
     GnssSensor,
     ImuSensor,
@@ -194,7 +196,7 @@ def simulate(
     streams = {
         name: np.random.default_rng(sequence)
         for name, sequence in zip(
-            ("gnss", "imu", "odometer", "angles", "gauge"), np.random.SeedSequence(seed).spawn(5), strict=True
+            ("gnss", "imu", "odometer", "angles", "gauge", "balise"), np.random.SeedSequence(seed).spawn(6), strict=True
         )
     }
     made: dict[str, Any] = {}
@@ -216,8 +218,10 @@ def simulate(
             made[name] = _odometer(path, motion, time, sensor, generator)
         elif name == "angles":
             made["gyro_angles"] = _angles(path, motion, time, sensor, generator)
-        else:
+        elif name == "gauge":
             made[name] = _gauge(path, motion, time, sensor, generator)
+        else:
+            made[name] = _balises(path, motion, time, sensor, generator)
     if progress is not None:
         progress("simulating sensors", len(carried), len(carried))
     if not truth_interval > 0.0:
@@ -424,3 +428,31 @@ def _gauge(
     # left and right are the vehicle's: facing against growing offset, the cant changes sign
     cant = path.at(distance).cant * path.nose(distance)
     return GaugeStream(time=time, gauge=sensor.gauge + noise[0], cant=cant + noise[1])
+
+
+def _balises(
+    path: Path, motion: Motion, time: FloatArray, sensor: BaliseSensor, generator: np.random.Generator
+) -> BaliseStream:
+    """Each balise of the model that the train runs over, in time; none where the model lists none."""
+    distance = np.clip(motion.at(time)[0], 0.0, path.length)
+    moving = np.append(np.diff(distance) > 0.0, False)  # standing rows would make the inversion ambiguous
+    model = path.model
+    found: list[tuple[float, str]] = []
+    for entry in model.provenance.get("balises", []):
+        track, offset = model.track_index(entry["track"]), float(entry["offset_m"])
+        for piece in np.flatnonzero(path.track == track):
+            here = path.distance[piece] + path.direction[piece] * (offset - path.entry[piece])
+            if not path.distance[piece] <= here <= path.distance[piece + 1]:
+                continue
+            if generator.random() < sensor.missed:
+                continue
+            read = here + generator.standard_normal() * sensor.sigma
+            found.append((float(np.interp(read, distance[moving], time[moving])), str(entry["id"])))
+    found.sort()
+    stamps = np.array([t for t, _ in found])
+    keep = np.append(True, np.diff(stamps) > 1e-6) if len(stamps) else np.zeros(0, bool)
+    return BaliseStream(
+        time=stamps[keep],
+        id=tuple(name for (_, name), kept in zip(found, keep, strict=True) if kept),
+        sigma=np.full(int(keep.sum()), sensor.sigma),
+    )

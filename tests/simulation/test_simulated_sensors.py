@@ -327,3 +327,20 @@ def test_simulate_does_named_faults_from_the_command_line(tmp_path):
     assert "gnss-silent-60s" in result.stderr
     assert not (tmp_path / "x").exists()
     assert "gnss-ramp-left-0.5" in CliRunner().invoke(main, ["simulate", "--list-faults"]).output
+
+
+def test_balises_are_read_where_they_lie_in_either_direction():
+    from dataclasses import replace
+
+    from railnav.simulation import BaliseSensor, Leg, Outfit, demo_line, simulate
+
+    model = demo_line(spacing=5.0)
+    places = {b["id"]: b["offset_m"] for b in model.provenance["balises"] if b["track"] == "77R-03"}
+    for leg in (Leg(("77R-03",), start=100.0, finish=3800.0), Leg(("77R-03",), start=3800.0, finish=100.0)):
+        run, truth = simulate(model, leg, seed=2, outfit=Outfit("reader", balise=BaliseSensor(missed=0.0)))
+        assert sorted(run.balise.id) == ["B-77R-03-1", "B-77R-03-2", "B-77R-03-3"]
+        there = np.interp(run.balise.time, truth.time, truth.offset)
+        np.testing.assert_allclose(there, [places[i] for i in run.balise.id], atol=1.5)
+    nameless = replace(model, provenance={})
+    run, _ = simulate(nameless, leg, seed=2, outfit=Outfit("reader", balise=BaliseSensor()))
+    assert len(run.balise.time) == 0
