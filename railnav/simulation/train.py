@@ -221,7 +221,8 @@ def simulate(
         elif name == "gauge":
             made[name] = _gauge(path, motion, time, sensor, generator)
         else:
-            made[name] = _balises(path, motion, time, sensor, generator)
+            read = _balises(path, motion, time, sensor, generator)
+            made[name] = read if len(read.time) else None
     if progress is not None:
         progress("simulating sensors", len(carried), len(carried))
     if not truth_interval > 0.0:
