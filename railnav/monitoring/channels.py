@@ -263,7 +263,7 @@ def _bands(recording: Recording, channels: dict[str, Channel], refused: dict[str
             key = f"{name}_{band.name.lower()}"
             fine = [(of, times) for of, times in present if of.spacing <= band.lower / SAMPLES_A_WAVE]
             if not present:
-                refused[key] = "the run has neither gyro angles nor an IMU"
+                refused[key] = "the run has neither gyro angles nor an IMU" + _gnss_instead(recording, name, band)
                 continue
             if not fine:
                 best = min(of.spacing for of, _ in present)
@@ -287,6 +287,17 @@ def _bands(recording: Recording, channels: dict[str, Channel], refused: dict[str
                 band,
                 of.spacing,
             )
+
+
+def _gnss_instead(recording: Recording, name: str, band: Band) -> str:
+    """What GNSS positions alone would leave in a band."""
+    of = recording.series.get("plan_gnss" if name == "alignment" else "height_gnss")
+    if of is None or not math.isfinite(of.spacing):
+        return ""
+    if of.spacing > band.lower / SAMPLES_A_WAVE:
+        return f"; its GNSS positions lie {of.spacing:.0f} m apart, too far for waves of {band.lower:g} m"
+    noise = band_noise(of.noise, of.spacing, band)
+    return f"; its GNSS positions would leave {1e3 * noise:,.0f} mm of noise in {band.name}"
 
 
 def _misplaced(recording: Recording, name: str, band: Band) -> float:

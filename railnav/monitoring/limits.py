@@ -26,6 +26,8 @@ CLASSES = "ABCDE"
 FINE_ENOUGH = 1.0 / 3.0
 #: Stretches beyond a limit, of one sign and nearer than this, are one defect, m.
 ONE_DEFECT = 2.0
+#: A passage whose track is certain in less than this share of its rows is not judged: which track it shows is not known.
+CERTAIN = 0.5
 #: Length over which standard deviations are taken, m, and the share of it that must be known.
 SEGMENT, KNOWN = 200.0, 0.5
 
@@ -226,6 +228,9 @@ def exceedances(geometry: Geometry, table: LimitTable, speed: float) -> tuple[li
         if not limits:
             verdicts.append(Verdict(key, title, sigma, math.nan, f"the table has no limit at {3.6 * speed:.0f} km/h"))
             continue
+        if geometry.recording.passage.probability < CERTAIN:
+            verdicts.append(Verdict(key, title, sigma, math.nan, "which track the run was on is not certain"))
+            continue
         mildest = min(min(abs(v) for v in limit.levels[limit.mildest]) for limit in limits)
         if not sigma <= FINE_ENOUGH * mildest:
             verdicts.append(Verdict(key, title, sigma, mildest, "its noise is over a third of the mildest limit"))
@@ -269,8 +274,8 @@ def _beyond(geometry: Geometry, channel: Channel, limit: Limit, there: NDArray[n
                     level=reached[-1],
                     value=float(x[k]),
                     limit=float(bound),
-                    start=float(distance[a]),
-                    finish=float(distance[b - 1]),
+                    start=float(distance[a]) - 0.5 * geometry.recording.step,
+                    finish=float(distance[b - 1]) + 0.5 * geometry.recording.step,
                     peak=float(distance[k]),
                     track=section.model.track_id[int(track)],
                     offset=float(offset),

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from railnav.errors import OffModelError, TrackError
 from railnav.monitoring.channels import TWIST_BASES, Geometry, channels_of
-from railnav.monitoring.limits import Exceedance, LimitTable, Segment, Verdict, exceedances, segments
+from railnav.monitoring.limits import CERTAIN, Exceedance, LimitTable, Segment, Verdict, exceedances, segments
 from railnav.monitoring.overlay import Overlay, overlay, shifted
 from railnav.monitoring.recording import record
 from railnav.monitoring.section import Passage, Section, onto, passages_of
@@ -158,6 +158,27 @@ def monitor(
         )
     if progress is not None:
         progress("channels", len(groups), len(groups))
+    notes += [
+        f"run {g.recording.run.id!r} on {part.section.name}: its track is certain in {100.0 * g.recording.passage.probability:.0f} % of "
+        "the rows; it may have been on a track beside, and is not judged"
+        for part in done
+        for g in part.geometries
+        if g.recording.passage.probability < CERTAIN
+    ]
+    gauges = sorted(
+        {
+            g.recording.gauge_nominal
+            for part in done
+            for g in part.geometries
+            if math.isfinite(g.recording.gauge_nominal)
+        }
+    )
+    wrong = [value for value in gauges if abs(value - table.gauge) > 0.003]
+    if wrong:
+        notes.append(
+            f"limits not applied: the table is for a gauge of {1e3 * table.gauge:.0f} mm, the runs show {1e3 * wrong[0]:.0f} mm; name a "
+            "table for it, or the nominal gauge"
+        )
     return Report(model, tuple(done), table, step, tuple(notes))
 
 
@@ -236,6 +257,9 @@ def _monitored(
     found: list[Exceedance] = []
     verdicts: list[tuple[Verdict, ...]] = []
     graded: list[tuple[Segment, ...]] = []
+    nominal = [g.recording.gauge_nominal for g in geometries if math.isfinite(g.recording.gauge_nominal)]
+    if any(abs(value - table.gauge) > 0.003 for value in nominal):
+        table = replace(table, limits=(), deviations=(), classes=())  # said in the report's notes
     latest_first = sorted(range(len(geometries)), key=lambda i: geometries[i].recording.run.start, reverse=True)
     judged = {i: exceedances(geometries[i], table, speed) for i in latest_first}
     for i in latest_first:
@@ -253,10 +277,3 @@ def _monitored(
         tuple(graded),
         tuple(trends(geometries)),
     )
-
-
-def gauge_agrees(report: Report) -> bool:
-    """Whether every run's nominal gauge is the one that the table of limits is for."""
-    wanted = report.table.gauge
-    found = [g.recording.gauge_nominal for part in report.sections for g in part.geometries]
-    return math.isnan(wanted) or all(math.isnan(g) or abs(g - wanted) < 0.003 for g in found)

@@ -1,0 +1,264 @@
+"""`railnav monitor`: track geometry of runs on a model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from railnav.cli._verb import PATH, json_option
+
+if TYPE_CHECKING:
+    from railnav.monitoring.limits import Exceedance
+    from railnav.monitoring.monitor import Report
+
+TABLE_ENDINGS = (".csv", ".parquet")
+#: Exceedances shown in the terminal.
+SHOWN = 20
+
+
+def _default_limits(ctx: click.Context, _: click.Parameter, value: bool) -> None:
+    if not value or ctx.resilient_parsing:
+        return
+    from railnav.io.limits import default_text
+
+    click.echo(default_text(), nl=False)
+    ctx.exit()
+
+
+@click.command("monitor")
+@click.argument("runs", type=PATH, nargs=-1, required=True, metavar="RUN...")
+@click.option("-m", "--model", type=PATH, required=True, help="Reference track model, .gpkg (or .geojson).")
+@click.option("-o", "--output", type=PATH, required=True, help="Page to write, .html.")
+@click.option("--channels", type=PATH, help="Also write all channels: .csv or .parquet.")
+@click.option("--exceedances", "list_file", type=PATH, help="Also write the exceedances of all runs: .csv or .parquet.")
+@click.option("--limits", type=PATH, help="Table of limits, .toml.  [default: standard gauge; see --default-limits]")
+@click.option(
+    "--default-limits",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_default_limits,
+    help="Print the default table of limits, to edit, and stop.",
+)
+@click.option(
+    "--tracks", metavar="TRACK,TRACK", help="The section: tracks in order.  [default: whatever the runs cover]"
+)
+@click.option(
+    "--speed",
+    type=click.FloatRange(0, 300, min_open=True),
+    help="Speed of the line for the limits, km/h.  [default: the class of the fastest run]",
+)
+@click.option(
+    "--gauge",
+    type=click.FloatRange(500, 2000),
+    help="Nominal gauge, mm.  [default: the usual one nearest to the median]",
+)
+@click.option(
+    "--base",
+    "bases",
+    type=click.FloatRange(0.5, 50),
+    multiple=True,
+    default=(3.0, 9.0),
+    show_default=True,
+    help="Twist base, m; may be given more than once.",
+)
+@click.option(
+    "--step", type=click.FloatRange(0.05, 1.0), default=0.25, show_default=True, help="Distance between values, m."
+)
+@click.option(
+    "--against",
+    type=click.Choice(["auto", "model", "nothing"]),
+    default="auto",
+    show_default=True,
+    help="Take the model's shape off level and alignment: auto does where the model is a design.",
+)
+@json_option
+def command(
+    runs: tuple[Path, ...],
+    model: Path,
+    output: Path,
+    channels: Path | None,
+    list_file: Path | None,
+    limits: Path | None,
+    tracks: str | None,
+    speed: float | None,
+    gauge: float | None,
+    bases: tuple[float, ...],
+    step: float,
+    against: str,
+    as_json: bool,
+) -> None:
+    """Work out track geometry channels from runs on a model, and hold them against limits.
+
+    Longitudinal level and alignment in D1, D2 and D3, cross level, twist, gauge and curvature, each from the streams that a RUN has; the
+    page says which bands its sensors can bear and which not. Several runs are laid over each other to the decimetre or better; runs of
+    several dates give growth per month.
+
+    \b
+    Example:
+      railnav monitor demo/survey-1 demo/survey-2 -m demo/line.gpkg -o geometry.html --channels channels.csv
+    """  # noqa: D301
+    from railnav.cli import _files
+    from railnav.cli._terminal import print_json, print_warnings, progress
+
+    inputs = [model, *([limits] if limits else []), *(member for run in runs for member in _files.members(run))]
+    _files.check_output(output, _files.PAGE_ENDINGS, inputs=inputs)
+    taken = [*inputs, output]
+    for extra in (channels, list_file):
+        if extra is not None:
+            _files.check_output(extra, TABLE_ENDINGS, inputs=taken)
+            if extra.resolve() in [
+                path.resolve() for path in (output, *([channels] if extra is list_file and channels else []))
+            ]:
+                raise click.UsageError(f"{extra} is named twice")
+    _files.need_report()
+    from railnav.io.limits import default_limits, read_limits
+    from railnav.io.run import read_run
+    from railnav.monitoring.monitor import monitor
+    from railnav.monitoring.section import section_of
+
+    table = read_limits(limits) if limits else default_limits()
+    reference = _files.read_model(model)
+    names = [name.strip() for name in tracks.split(",") if name.strip()] if tracks is not None else []
+    section = section_of(reference, names) if tracks is not None else None
+    with progress() as tell:
+        report = monitor(
+            [read_run(run) for run in runs],
+            reference,
+            table,
+            section=section,
+            speed=speed / 3.6 if speed else None,
+            step=step,
+            gauge=gauge / 1e3 if gauge else None,
+            bases=bases,
+            against_model={"auto": None, "model": True, "nothing": False}[against],
+            progress=tell,
+        )
+    from railnav.web.geometry import geometry_page
+
+    page = geometry_page(report)
+    found = [e for part in report.sections for e in part.exceedances]
+    if channels is not None:
+        from railnav.io.geometry import write_channels
+
+        write_channels(report, channels)
+    if list_file is not None:
+        from railnav.io.geometry import write_exceedances
+
+        write_exceedances(found, list_file)
+    _files.write_text(output, page)
+    written = [path for path in (output, channels, list_file) if path is not None]
+    if as_json:
+        print_json({**facts(report), "output": output, "channels": channels, "exceedances_file": list_file})
+        return
+    print_warnings(report.notes)
+    _print(report, found, written)
+
+
+def facts(report: Report) -> dict[str, Any]:
+    """The report as plain facts: sections, runs, channels with their sigma, counts and places of exceedances."""
+    return {
+        "limits": report.table.name,
+        "limits_recalled": report.table.recalled,
+        "notes": list(report.notes),
+        "sections": [
+            {
+                "section": part.section.name,
+                "tracks": [report.model.track_id[i] for i in part.section.track],
+                "length_m": part.section.length,
+                "speed_kmh": 3.6 * part.speed,
+                "runs": [
+                    {
+                        "run": g.recording.run.id,
+                        "covered": g.recording.covered,
+                        "sigma_along_m": g.recording.passage.sigma,
+                        "shift_left_m": None if lies is None else lies.scatter,
+                        "against_model": g.recording.against_model,
+                        "channels": {
+                            v.channel: {"sigma": v.sigma, "judged": not v.reason, "reason": v.reason} for v in verdicts
+                        },
+                        "refused": g.refused,
+                        "notes": list(g.recording.notes),
+                    }
+                    for g, lies, verdicts in zip(part.geometries, part.overlays, part.verdicts, strict=True)
+                ],
+                "exceedances": [
+                    {
+                        "channel": e.channel,
+                        "level": e.level,
+                        "value_mm": 1e3 * e.value,
+                        "limit_mm": 1e3 * e.limit,
+                        "length_m": e.length,
+                        "track": e.track,
+                        "offset_m": e.offset,
+                        "chainage_km": e.chainage / 1e3,
+                        "easting_m": e.easting,
+                        "northing_m": e.northing,
+                        "status": e.status,
+                        "run": e.run,
+                    }
+                    for e in part.exceedances
+                ],
+                "trends": {
+                    t.channel: {
+                        "significant": int(t.growth.significant.sum()),
+                        "segments": len(t.start),
+                        "noise_mm": 1e3 * t.growth.noise,
+                    }
+                    for t in part.trends
+                },
+            }
+            for part in report.sections
+        ],
+    }
+
+
+def _print(report: Report, found: list[Exceedance], written: list[Path]) -> None:
+    from railnav.cli._terminal import print_table
+    from railnav.web import words
+    from railnav.web.geometry import LEVEL_WORDS
+    from railnav.web.geometry import SHOWN as UNITS
+
+    rows = []
+    for part in report.sections:
+        for g, verdicts in zip(part.geometries, part.verdicts, strict=True):
+            judged = [v.title for v in verdicts if not v.reason]
+            mine = [e for e in part.exceedances if e.run == g.recording.run.id]
+            rows.append(
+                [
+                    part.section.name,
+                    g.recording.run.id,
+                    words.length(g.recording.covered * part.section.length, 4),
+                    len(g.channels),
+                    len(judged),
+                    len(mine),
+                    sum(e.level == "immediate" for e in mine),
+                ]
+            )
+    print_table(
+        "Sections", ("section", "run", "covers", "channels", "judged", "beyond limits", "immediate"), rows, left=2
+    )
+    refused = {key: reason for part in report.sections for g in part.geometries for key, reason in g.refused.items()}
+    print_table(
+        "Not given", ("channel", "why"), [[key.replace("_", " "), reason] for key, reason in refused.items()], left=2
+    )
+    shown = []
+    for e in found[:SHOWN]:
+        factor, unit = UNITS[e.unit]
+        shown.append(
+            [
+                e.title,
+                LEVEL_WORDS[e.level] + ("" if e.status == "read" else f" ({e.status})"),
+                e.run,
+                e.track,
+                f"{e.offset:,.1f} m",
+                f"{factor * e.value:+.1f} {unit}",
+                f"{factor * e.limit:+.1f}",
+                f"{e.length:.1f} m",
+            ]
+        )
+    title = f"Exceedances ({len(shown)} of {len(found)})" if len(found) > len(shown) else "Exceedances"
+    print_table(title, ("channel", "limit", "run", "track", "offset", "value", "limit value", "length"), shown, left=4)
+    click.echo(f"{', '.join(map(str, written))} written")

@@ -1,0 +1,121 @@
+"""Tables of track geometry: channels along the line and exceedances, CSV or Parquet."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railnav.io.atomic import atomic_path
+from railnav.io.tables import Words, write_table
+from railnav.monitoring.limits import Exceedance
+from railnav.monitoring.monitor import Report
+
+FloatArray = NDArray[np.float64]
+
+#: Factor, ending of the column and decimals of each SI unit.
+_UNITS = {"m": (1e3, "_mm", 3), "m/m": (1e3, "_mm_m", 4), "1/m": (1.0, "_1_m", 8)}
+
+
+def write_channels(report: Report, path: str | Path) -> int:
+    """Write every channel of every run, one row a place.
+
+    Columns: `run, section, distance_m, track, offset_m, chainage_km, easting_m, northing_m, speed_kmh`, then the channels (`gauge_mm,
+    cross_level_mm, twist_3m_mm_m, longitudinal_level_d1_mm, ..., curvature_1_m`); empty where a run gives none.
+
+    Parameters
+    ----------
+    report : Report
+    path : path
+        .csv or .parquet; replaced whole or not at all.
+
+    Returns
+    -------
+    int
+        Rows written: those where the run was.
+    """
+    units: dict[str, str] = {}
+    for part in report.sections:
+        for geometry in part.geometries:
+            units.update({key: channel.unit for key, channel in geometry.channels.items()})
+    columns: dict[str, list[FloatArray]] = {}
+    texts: dict[str, list[str]] = {"run": [], "section": []}
+    tracks: list[NDArray[np.int64]] = []
+    for part in report.sections:
+        for geometry in part.geometries:
+            r = geometry.recording
+            there = np.flatnonzero(np.isfinite(r.time))
+            d = r.distance[there]
+            track, offset = part.section.locate(d)
+            point = part.section.at(d)
+            tracks.append(np.asarray(track, np.int64))
+            texts["run"] += [r.run.id] * len(there)
+            texts["section"] += [part.section.name] * len(there)
+            row = {
+                "distance_m": d,
+                "offset_m": offset,
+                "chainage_km": point.chainage / 1e3,
+                "easting_m": point.easting,
+                "northing_m": point.northing,
+                "speed_kmh": 3.6 * r.speed[there],
+            }
+            for key, unit in units.items():
+                factor, ending, _ = _UNITS[unit]
+                channel = geometry.channels.get(key)
+                row[key + ending] = np.full(len(there), np.nan) if channel is None else channel.values[there] * factor
+            for name, values in row.items():
+                columns.setdefault(name, []).append(values)
+    table: dict[str, FloatArray | Words] = {
+        "run": Words.of(texts["run"]),
+        "section": Words.of(texts["section"]),
+        "track": Words(np.concatenate(tracks), report.model.track_id),
+    }
+    table |= {name: np.concatenate(parts) for name, parts in columns.items()}
+    decimals = {"distance_m": 3, "offset_m": 3, "chainage_km": 6, "easting_m": 3, "northing_m": 3, "speed_kmh": 1}
+    decimals |= {key + _UNITS[unit][1]: _UNITS[unit][2] for key, unit in units.items()}
+    with atomic_path(path) as draft:
+        write_table(draft, table, decimals=decimals)
+    return len(texts["run"])
+
+
+def write_exceedances(found: Sequence[Exceedance], path: str | Path) -> None:
+    """Write exceedances, one row a place: channel, level, value, limit, track, offset, chainage, coordinates, status, source, run.
+
+    Parameters
+    ----------
+    found : sequence of Exceedance
+    path : path
+        .csv or .parquet; replaced whole or not at all. Values and limits are millimetres (twist: mm/m).
+    """
+
+    def numbers(name: str, factor: float = 1.0) -> FloatArray:
+        return np.array([factor * float(getattr(e, name)) for e in found], float)
+
+    table: dict[str, FloatArray | Words] = {
+        "channel": Words.of(e.channel for e in found),
+        "level": Words.of(e.level for e in found),
+        "value_mm": numbers("value", 1e3),
+        "limit_mm": numbers("limit", 1e3),
+        "length_m": numbers("length"),
+        "track": Words.of(e.track for e in found),
+        "offset_m": numbers("offset"),
+        "chainage_km": numbers("chainage", 1e-3),
+        "easting_m": numbers("easting"),
+        "northing_m": numbers("northing"),
+        "status": Words.of(e.status for e in found),
+        "source": Words.of(e.source for e in found),
+        "run": Words.of(e.run for e in found),
+    }
+    decimals = {
+        "value_mm": 2,
+        "limit_mm": 2,
+        "length_m": 2,
+        "offset_m": 2,
+        "chainage_km": 5,
+        "easting_m": 3,
+        "northing_m": 3,
+    }
+    with atomic_path(path) as draft:
+        write_table(draft, table, decimals=decimals)
