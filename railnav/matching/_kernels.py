@@ -35,16 +35,28 @@ def source_stamp(*modules: ModuleType) -> int:
 
 #: Columns of a packed knot: one cache line of eight doubles. Tangents are grid metres per metre of offset.
 OFFSET, EAST, NORTH, D_EAST, D_NORTH, CURVATURE, GRADIENT, CANT = range(8)
-#: Columns of an evaluated point of a path: as a knot without its offset, d(gradient)/ds, and the model's sigma across the track, m.
-P_EAST, P_NORTH, P_D_EAST, P_D_NORTH, P_CURVATURE, P_GRADIENT, P_CANT, P_GRADIENT_RATE, P_SIGMA_CROSS = range(9)
-POINT_SIZE = 9
+#: Columns of an evaluated point of a path: as a knot without its offset, d(gradient)/ds, the model's sigma across the track, m, d(cant)/ds.
+(
+    P_EAST,
+    P_NORTH,
+    P_D_EAST,
+    P_D_NORTH,
+    P_CURVATURE,
+    P_GRADIENT,
+    P_CANT,
+    P_GRADIENT_RATE,
+    P_SIGMA_CROSS,
+    P_CANT_RATE,
+) = range(10)
+POINT_SIZE = 10
 #: Integer marks of a hypothesis.
 COUNT, CURRENT, RECORD, VERSION, MOVED, SIGN = range(6)
 TAGS = 6
-#: Real-valued marks of a hypothesis: time the slip began (-inf: none), time since when the wheel agrees again, evidence that fades, and
-#: how much of it is believed; then its ledger, what each kind of evidence has added to its log-weight.
-SLIP_SINCE, AGREE_SINCE, FADING, BELIEVED = range(4)
-LEDGER = 4
+#: Real-valued marks of a hypothesis: time the slip began (-inf: none), time since when the wheel agrees again, evidence that fades, how
+#: much of it is believed, path coordinate up to which balises are accounted for; then its ledger, what each kind of evidence has added
+#: to its log-weight.
+SLIP_SINCE, AGREE_SINCE, FADING, BELIEVED, PASSED = range(5)
+LEDGER = 5
 (
     BY_PATH,  # prior of the start and of each turnout's legs, the end of the line
     BY_POSITION,
@@ -72,6 +84,8 @@ class Network(NamedTuple):
     move_start: IntArray  # (2 t + 1,) CSR pointer by track end 2 * track + end
     move_to: IntArray  # (2 m,) track end entered
     stop: IntArray  # (2 t,) 1: a buffer stop stands at this track end
+    balise_start: IntArray  # (t + 1,)
+    balise: FloatArray  # (b,) offset from the track's start, m, growing on each track
 
 
 class Bank(NamedTuple):
@@ -135,6 +149,7 @@ def track_point(net, track, way, local, out):  # m from the entering end -> out 
     out[P_CANT] = sign * (v * knots[j, CANT] + u * knots[j + 1, CANT])
     out[P_SIGMA_CROSS] = v * net.sigma_cross[j] + u * net.sigma_cross[j + 1]
     out[P_GRADIENT_RATE] = (knots[j + 1, GRADIENT] - knots[j, GRADIENT]) / h if over == 0.0 else 0.0
+    out[P_CANT_RATE] = (knots[j + 1, CANT] - knots[j, CANT]) / h if over == 0.0 else 0.0
 
 
 @part

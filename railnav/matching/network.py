@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from railnav.matching._kernels import Network
 from railnav.track.model import NodeKind, TrackModel
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
 
 def pack_network(model: TrackModel) -> Network:
@@ -51,6 +55,7 @@ def pack_network(model: TrackModel) -> Network:
     leave, enter = np.concatenate([a, b]), np.concatenate([b, a])
     order = np.argsort(leave, kind="stable")
     counts = np.bincount(leave, minlength=2 * len(model.track_id))
+    balise_start, balise = _balises(model)
     return Network(
         np.ascontiguousarray(knots),
         np.nan_to_num(np.sqrt(np.maximum(across, 0.0))),
@@ -61,4 +66,36 @@ def pack_network(model: TrackModel) -> Network:
         (model.nodes.kind[np.column_stack([model.start_node, model.end_node]).ravel()] == NodeKind.BUFFER_STOP).astype(
             np.int64
         ),
+        balise_start,
+        balise,
     )
+
+
+def balises_of(model: TrackModel) -> dict[str, tuple[int, float]]:
+    """Where the model's balises lie, by identifier and by name: track index and offset from the track's start, m.
+
+    They stand in `provenance["balises"]`, a list of objects with `track`, `offset_m` and `id` or `name`, as the import from railML
+    writes it; entries of other tracks are left out.
+    """
+    found: dict[str, tuple[int, float]] = {}
+    entries = model.provenance.get("balises", [])
+    if not isinstance(entries, list):
+        return found
+    index = {track: i for i, track in enumerate(model.track_id)}
+    for entry in entries:
+        track = index.get(str(entry.get("track", "")))
+        if track is None:
+            continue
+        first = float(model.offset[model.knot_start[track]])
+        for name in (entry.get("name"), entry.get("id")):
+            if name:
+                found[str(name)] = (track, float(entry["offset_m"]) - first)
+    return found
+
+
+def _balises(model: TrackModel) -> tuple[IntArray, FloatArray]:
+    """The model's balises by track: CSR pointer and offsets."""
+    places = sorted(set(balises_of(model).values()))
+    track = np.array([t for t, _ in places], np.int64)
+    start = np.searchsorted(track, np.arange(len(model.track_id) + 1)).astype(np.int64)
+    return start, np.array([offset for _, offset in places], np.float64)

@@ -49,7 +49,13 @@ from railnav.matching._kernels import (
 from railnav.navigation import columns, state
 from railnav.navigation.columns import (
     ACCELEROMETER_BIAS,
+    BALISE_OFFSET,
+    BALISE_REACH,
+    BALISE_TRACK,
     BLIND_LENGTH,
+    BRIDGED,
+    C_BALISE_TIME,
+    C_BALISES,
     C_DISTRUST,
     C_FIX_TIME,
     C_FIXES,
@@ -70,6 +76,7 @@ from railnav.navigation.columns import (
     C_START_TIME,
     C_STEPS,
     C_STOOD,
+    C_STRANGE_BALISES,
     C_SUSPECT_FIXES,
     C_SUSPECT_SINCE,
     C_SUSPECTS,
@@ -82,6 +89,7 @@ from railnav.navigation.columns import (
     EAST,
     FORCE,
     GNSS_EAST,
+    HELD,
     K_CORRELATED,
     K_FRAME,
     K_FRAME_LEAST,
@@ -107,7 +115,7 @@ from railnav.navigation.columns import (
     K_STEP_FIXES,
     K_TAG_MOST,
     K_USABLE,
-    MAP_CROSS,
+    NEEDS_BALISE,
     NEEDS_RIVALS,
     NEEDS_ROOM,
     NEEDS_START,
@@ -163,7 +171,14 @@ from railnav.navigation.dynamics._kernels import (
 )
 from railnav.navigation.integrity import _kernels as integrity
 from railnav.navigation.measurements import _kernels as measurements
-from railnav.navigation.measurements._kernels import direction, gravity_pull, motion_rows, position_row, wheel_row
+from railnav.navigation.measurements._kernels import (
+    balise_place,
+    direction,
+    gravity_pull,
+    motion_rows,
+    position_row,
+    wheel_row,
+)
 from railnav.navigation.standing import _kernels as standing
 from railnav.navigation.standing._kernels import depart, kick, remember, stands, watch
 
@@ -227,15 +242,16 @@ def adapt(fil, shared, bank, work, time, dt):
 def stretch_variance(fil, point, travel):
     """Variance of what the model's length is wrong by over some metres.
 
-    An axis that is off by y across in curvature kappa is longer by kappa y a metre; where it is known by smoothness alone (sigma of
-    metres) its bearing is wrong, too, which only lengthens. Both last over the length that the error across is correlated over.
+    An axis that is off by y across in curvature kappa is longer by kappa y a metre; where it is known by smoothness alone its bearing
+    is wrong, too, which makes it longer by half the square of that. Both last over the length that the error across lasts. A bridge is
+    held at its ends: along it the error is well below its largest on average.
     """
     sigma = point[P_SIGMA_CROSS]
-    if fil.at[MAP_CROSS] < 0 or sigma <= 0.0:
+    if sigma <= 0.0:
         return 0.0
-    length = fil.settings[K_MAP_LENGTH]
-    tilt = sigma / BLIND_LENGTH
-    rate = abs(point[P_CURVATURE]) * sigma + 0.5 * tilt * tilt
+    tilt = 0.5 * sigma / BLIND_LENGTH
+    rate = HELD * abs(point[P_CURVATURE]) * sigma + 0.5 * tilt * tilt
+    length = BLIND_LENGTH if sigma > BRIDGED * fil.map_sigma else fil.settings[K_MAP_LENGTH]
     return 2.0 * length * rate * rate * travel
 
 
@@ -279,6 +295,19 @@ def predict_all(fil, net, bank, work, row, dt):
             work.vector[W_NEW],
         )
         predict(x, bank.P_sqrt[h], work.F, work.Q, work.lead, columns, work.vector[W_NEW])
+
+
+@part
+def explained(fil, net, bank, row):
+    """Whether any hypothesis is near the balise that is read."""
+    i_s = fil.at[POSITION]
+    for i in range(bank.live[0]):
+        h = bank.live[1 + i]
+        s = bank.x[h, i_s]
+        at = balise_place(net, bank, h, int(row[BALISE_TRACK]), row[BALISE_OFFSET], s)
+        if abs(at - s) <= 4.0 * math.sqrt(variance_of(bank.P_sqrt[h], i_s)) + 5.0 * BALISE_REACH:
+            return True
+    return False
 
 
 @part
@@ -588,6 +617,12 @@ def _compiled(stamp: int) -> Any:
                 return e, NEEDS_START
             if bank.live[0] > 0 and seen and row[TIME] - shared.common[C_RIVAL_TIME] >= RIVAL_INTERVAL:
                 return e, NEEDS_RIVALS
+            if row[BALISE_TRACK] >= 0.0 and shared.common[C_BALISE_TIME] < row[TIME]:
+                shared.common[C_BALISE_TIME] = row[TIME]
+                shared.common[C_BALISES] += 1.0
+                if not explained(fil, net, bank, row):
+                    shared.common[C_STRANGE_BALISES] += 1.0
+                    return e, NEEDS_BALISE
             watch(fil, shared, row)
             advance(fil, net, shared, bank, work, records, row, e)
             remember(shared, row)

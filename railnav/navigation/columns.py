@@ -22,9 +22,11 @@ FRAME_EAST, FRAME_NORTH, GNSS_EAST, GNSS_NORTH = (
 )
 MAP_CROSS = int(State.MAP_CROSS)
 TIME_TAG, SPEED_LATENCY, SPEED_ERROR = int(State.TIME_TAG), int(State.SPEED_LATENCY), int(State.SPEED_ERROR)
-ODOMETER_SCALE, GYRO_BIAS, ACCELEROMETER_BIAS = (
+ODOMETER_SCALE, GYRO_BIAS, GYRO_TILT, SIDE_BIAS, ACCELEROMETER_BIAS = (
     int(State.ODOMETER_SCALE),
     int(State.GYRO_BIAS),
+    int(State.GYRO_TILT),
+    int(State.SIDE_BIAS),
     int(State.ACCELEROMETER_BIAS),
 )
 ACCELERATION, SPEED, POSITION, WHEEL_DISTANCE = (
@@ -72,6 +74,12 @@ K_FORCE_WALK = SETTING["accelerometer_walk"]
 K_GYRO_WALK = SETTING["gyro_walk"]
 K_GYRO_FLOOR = SETTING["gyro_floor"]
 K_GYRO_SCALE = SETTING["gyro_scale"]
+K_SIDE_WALK = SETTING["side_walk"]
+K_SIDE_NOISE = SETTING["side_noise"]
+K_SIDE_TIME = SETTING["side_time"]
+K_SIDE_SCALE = SETTING["side_scale"]
+K_BALISE_SIGMA = SETTING["balise_sigma"]
+K_BALISE_MISSED = SETTING["balise_missed"]
 K_CURVATURE_SIGMA = SETTING["curvature_sigma"]
 K_CURVATURE_SHIFT = SETTING["curvature_shift"]
 K_CURVATURE_LENGTH = SETTING["curvature_length"]
@@ -114,8 +122,12 @@ K_GRAVITY = SETTING["gravity"]
     FORCE,  # forward specific force, mean since the epoch before
     YAW_RATE,  # about the down axis, mean since the epoch before, Earth rate taken off
     SIGMA_YAW,
-) = range(15)
-EPOCH_SIZE = 15
+    SIDE,  # specific force to the right, mean since the epoch before
+    BALISE_TRACK,  # index of the track of the balise that is read
+    BALISE_OFFSET,  # from that track's start, m
+    SIGMA_BALISE,
+) = range(19)
+EPOCH_SIZE = 19
 
 #: Columns of the output table.
 (
@@ -176,8 +188,11 @@ OUTPUT_SIZE = 13
     C_UNSEEN,  # probability that the train is on a track that begins farther on
     C_OUT_MODE,
     C_TOLD_TRACK,  # as in the row before, -1 where there was none
-) = range(39)
-COMMON_SIZE = 39
+    C_BALISE_TIME,  # latest reading
+    C_BALISES,
+    C_STRANGE_BALISES,
+) = range(42)
+COMMON_SIZE = 42
 #: How often tracks nearby that no hypothesis holds are given a rival, s.
 RIVAL_INTERVAL = 60.0
 #: Odometer readings remembered: time, distance.
@@ -202,6 +217,14 @@ KICK = 0.7
 SILENT_NOISE = 0.4
 #: Squared normalised innovation at which a single sensor row is held; its evidence saturates there.
 ROW_GATE = 16.0
+#: ln p of a balise that a hypothesis has no explanation for: read in error, or its place in the model is wrong.
+STRANGE_BALISE = -14.0
+#: How far a hypothesis may be from a balise that is read, beyond four sigmas, m.
+BALISE_REACH = 10.0
+#: A stretch of the model this many times as poor as it usually is has been bridged by smoothness.
+BRIDGED = 3.0
+#: Mean error across of such a bridge, of its largest.
+HELD = 0.6
 #: How much weaker the evidence of positions is when model or receiver are off by more than they say: sigmas five times as large.
 DOUBTED = 25.0
 #: Change of curvature a metre that the linearised course allows for, 1/m^2.
@@ -225,7 +248,7 @@ SLOT_SIZE = 11
 NOISES = 16
 
 #: Why the loop stopped.
-DONE, NEEDS_START, NEEDS_ROOM, NEEDS_RIVALS = range(4)
+DONE, NEEDS_START, NEEDS_ROOM, NEEDS_RIVALS, NEEDS_BALISE = range(5)
 
 #: Columns of a line in the journal; the ledger of evidence follows, then the row is full.
 J_EPOCH, J_DECISION, J_TRACK, J_WAY, J_OFFSET, J_WEIGHT, J_SIGMA, J_SPEED = range(8)
@@ -242,12 +265,13 @@ GAUSS_HERMITE_WEIGHTS = np.array(
 class Filter(NamedTuple):
     """What stays the same over a run."""
 
-    at: IntArray  # (15,) index of each state, -1 absent
+    at: IntArray  # (17,) index of each state, -1 absent
     settings: FloatArray  # Settings.packed()
     lever: FloatArray  # (3,) reference point to antenna: forward, right, down, m
     risk: FloatArray  # (2,) integrity risk, two-sided normal quantile
     signed: int  # 1: the odometer counts backwards when backing up
     map_sigma: float = 0.0  # usual error of the model across its tracks, m
+    reads_balises: int = 0  # 1: the train has a reader: a balise passed in silence is evidence
 
 
 class Shared(NamedTuple):

@@ -29,6 +29,8 @@ IntArray = NDArray[np.int64]
 SLOTS, WINDOW = 48, 12
 #: Most that a rival can gain or lose by the GNSS error that the train on its track would have, nat.
 RIVAL_CREDIT = 6.0
+#: Prior odds of a place that a balise shows and no hypothesis is near.
+BALISE_PRIOR = 1e-3
 #: A model's error across its tracks beyond this is estimated, m; what is smaller counts towards the constant part.
 MAP_ERROR_LEAST = 0.1
 #: How near to a start a track may begin that the train may be making for, m, and how often such tracks are looked for, s.
@@ -42,7 +44,7 @@ class Engine:
     ----------
     model : TrackModel
     settings : Settings
-    imu, odometer, speed, signed_odometer, lever_arm_b, receiver, integrity_risk
+    imu, odometer, speed, signed_odometer, lever_arm_b, receiver, integrity_risk, balises
         As for `railnav.navigation.Navigator`.
     records : int
         Room for the smoother's records, to begin with; 0 keeps none.
@@ -80,6 +82,7 @@ class Engine:
         lever_arm_b: ArrayLike,
         integrity_risk: float,
         receiver: str = "",
+        balises: bool = False,
         records: int = 0,
         journal: int = 0,
     ) -> None:
@@ -118,7 +121,8 @@ class Engine:
             np.array(lever_arm_b, np.float64).reshape(3),
             np.array([integrity_risk, normal_quantile(integrity_risk)]),
             int(signed_odometer),
-            float(np.median(self.network.sigma_cross)) if map_error else 0.0,
+            float(np.median(self.network.sigma_cross)),
+            int(balises),
         )
         self.bank = paths.Bank(
             np.zeros((SLOTS, n)),
@@ -134,7 +138,7 @@ class Engine:
             np.zeros(SLOTS, np.int64),
         )
         common = np.zeros(c.COMMON_SIZE)
-        never = [c.C_TIME, c.C_FIX_TIME, c.C_TRY, c.C_WHEEL_SEEN, c.C_GNSS_SPEED_TIME, c.C_DISTRUST]
+        never = [c.C_TIME, c.C_FIX_TIME, c.C_TRY, c.C_WHEEL_SEEN, c.C_GNSS_SPEED_TIME, c.C_DISTRUST, c.C_BALISE_TIME]
         common[never] = -np.inf
         common[[c.C_WHEEL_MOVED, c.C_GNSS_STILL]] = np.inf
         common[c.C_SCALE] = self.settings.scale_start
@@ -184,6 +188,8 @@ class Engine:
                     self.records = _grown(self.records)
                 if self.journal.used[1] > 0:
                     self.journal = c.Journal(_doubled(self.journal.lines), self.journal.used)
+            elif why == c.NEEDS_BALISE:
+                self._find_by_balise(table[first])
             elif why == c.NEEDS_RIVALS:
                 self._give_rivals(table[first])
             else:
@@ -265,6 +271,7 @@ class Engine:
                 bank.info[h] = 0.0
                 bank.info[h, [paths.SLIP_SINCE, paths.AGREE_SINCE]] = -np.inf
                 bank.info[h, paths.BY_PATH] = math.log(prior)
+                bank.info[h, paths.PASSED] = local
 
         self._foresee(row, {start.track for start in found}, total)
 
@@ -368,6 +375,7 @@ class Engine:
             bank.info[h] = bank.info[best]
             bank.info[h, [paths.FADING, paths.BELIEVED]] += likelier
             bank.info[h, paths.BY_PATH] += math.log(odds)
+            bank.info[h, paths.PASSED] = local
             bank.info[h, paths.BY_POSITION] += likelier
         if self._unseen:
             away = np.hypot(self._loose[:, 2] - here[0], self._loose[:, 3] - here[1])
@@ -375,6 +383,39 @@ class Engine:
             self._unseen = {t: odds for t, odds in self._unseen.items() if t in near and t not in held}
         if common[c.C_UNSEEN] > 0.0:
             self._share_unseen(row)
+
+    def _find_by_balise(self, row: FloatArray) -> None:
+        """Put a hypothesis on a balise that is read and that no hypothesis is near: the navigator is lost, or the reading is wrong.
+
+        It takes over the best hypothesis' motion and sensor errors and is worth little; the others lose more by the reading.
+        """
+        bank, at = self.bank, self.filter.at
+        track, offset = int(row[c.BALISE_TRACK]), float(row[c.BALISE_OFFSET])
+        living = self.living()
+        best = max(living, key=lambda h: (float(bank.logw[h]), -h), default=-1)
+        if best < 0 or len(living) > int(self.settings.most_hypotheses):
+            return
+        for way in (1, -1):
+            h = paths.take_slot(bank)
+            if h < 0:
+                return
+            local = offset if way > 0 else float(self.network.length[track]) - offset
+            P = bank.P_sqrt[best] @ bank.P_sqrt[best].T
+            i_s = int(at[State.POSITION])
+            P[i_s, :] = P[:, i_s] = 0.0
+            P[i_s, i_s] = 25.0
+            bank.x[h] = bank.x[best]
+            bank.x[h, i_s] = local
+            bank.P_sqrt[h] = np.linalg.cholesky(P + 1e-12 * np.eye(len(P)))
+            bank.logw[h] = bank.logw[best] + math.log(0.5 * BALISE_PRIOR)
+            bank.track[h, 0], bank.way[h, 0], bank.begin[h, 0] = track, way, 0.0
+            bank.armed[h] = 0
+            bank.tags[h] = bank.tags[best]
+            bank.tags[h, [paths.COUNT, paths.CURRENT]] = 1, 0
+            bank.tags[h, [paths.RECORD, paths.VERSION]] = -1
+            bank.info[h] = bank.info[best]
+            bank.info[h, paths.BY_PATH] += math.log(0.5 * BALISE_PRIOR)
+            bank.info[h, paths.PASSED] = local
 
     def _believing(
         self, x: FloatArray, P: FloatArray, error: FloatArray, spread: FloatArray, point: FloatArray
@@ -408,6 +449,8 @@ class Engine:
         sd[State.SPEED_LATENCY] = settings.speed_latency
         sd[State.ODOMETER_SCALE] = settings.odometer_scale
         sd[State.GYRO_BIAS] = settings.gyro_bias
+        sd[State.GYRO_TILT] = settings.gyro_tilt
+        sd[State.SIDE_BIAS] = settings.side_bias
         sd[State.ACCELEROMETER_BIAS] = settings.accelerometer_bias
         sd[State.ACCELERATION] = settings.acceleration_sigma
         sd[State.SPEED] = sigma_v

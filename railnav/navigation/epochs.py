@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +55,12 @@ class Epoch:
         Specific force along the vehicle's nose, mean since the epoch before, m/s^2.
     yaw_rate, sigma_yaw_rate : float
         Rate about the vehicle's down axis, mean since the epoch before, and sigma of that mean, rad/s.
+    side_force : float
+        Specific force to the vehicle's right, mean since the epoch before, m/s^2.
+    sigma_balise : float
+        Sigma of the balise's place, m.
+    balise : str
+        Identifier of the balise read now; empty when none is.
     """
 
     time: float
@@ -72,10 +78,14 @@ class Epoch:
     forward_force: float = NAN
     yaw_rate: float = NAN
     sigma_yaw_rate: float = NAN
+    side_force: float = NAN
+    sigma_balise: float = NAN
+    balise: str = ""
 
 
-#: Columns of the raw table of epochs: the fields of `Epoch`.
-COLUMNS = tuple(Epoch.__slots__)
+#: Columns of the raw table of epochs: the numbers of `Epoch`, then track and offset of the balise, resolved.
+COLUMNS = (*(name for name in Epoch.__slots__ if name != "balise"), "balise_track", "balise_offset")
+_NUMBERS = len(COLUMNS) - 2
 _AT = {name: i for i, name in enumerate(COLUMNS)}
 #: Columns that the kernels read as they come.
 _PLAIN = tuple(
@@ -90,6 +100,10 @@ _PLAIN = tuple(
         ("forward_force", c.FORCE),
         ("yaw_rate", c.YAW_RATE),
         ("sigma_yaw_rate", c.SIGMA_YAW),
+        ("side_force", c.SIDE),
+        ("balise_track", c.BALISE_TRACK),
+        ("balise_offset", c.BALISE_OFFSET),
+        ("sigma_balise", c.SIGMA_BALISE),
     )
 )
 
@@ -108,12 +122,18 @@ def epochs(run: Run) -> Iterator[Epoch]:
     ------
     Epoch
     """
-    for row in raw_table(run).tolist():
-        yield Epoch(*row)
+    table = raw_table(run)
+    read = (
+        {}
+        if run.balise is None
+        else dict(zip(_rows(table[:, 0], run.balise.time).tolist(), run.balise.id, strict=True))
+    )
+    for i, row in enumerate(table.tolist()):
+        yield replace(Epoch(*row[:_NUMBERS]), balise=read.get(i, "")) if i in read else Epoch(*row[:_NUMBERS])
 
 
-def raw_table(run: Run) -> FloatArray:
-    """A run as a table of epochs, (m, 15), columns as the fields of `Epoch`.
+def raw_table(run: Run, balises: Mapping[str, tuple[int, float]] | None = None) -> FloatArray:
+    """A run as a table of epochs, (m, 19), columns as `COLUMNS`; `balises` says where balises lie: track index and offset, m.
 
     Raises
     ------
@@ -131,6 +151,8 @@ def raw_table(run: Run) -> FloatArray:
     times = [gnss.time]
     if odometer is not None and len(wheel):
         times.append(odometer.time[wheel])
+    if run.balise is not None and len(run.balise.time):
+        times.append(run.balise.time)
     time = np.sort(np.concatenate(times))
     time = time[np.append(True, np.diff(time) > SAME_TIME)]
     time = _filled(time, imu)
@@ -151,10 +173,17 @@ def raw_table(run: Run) -> FloatArray:
             if value is not None:
                 table[rows, _AT[name]] = value[wheel]
     if imu is not None and len(imu):
-        force, rate, sigma = _inertial_means(imu, time)
+        force, side, rate, sigma = _inertial_means(imu, time)
+        table[:, _AT["side_force"]] = side
         table[:, _AT["forward_force"]] = force
         table[:, _AT["yaw_rate"]] = rate
         table[:, _AT["sigma_yaw_rate"]] = sigma
+    if run.balise is not None and balises:
+        sigmas = run.balise.sigma
+        for i, row in enumerate(_rows(time, run.balise.time).tolist()):
+            if (place := balises.get(run.balise.id[i])) is not None:
+                table[row, [_AT["balise_track"], _AT["balise_offset"]]] = place
+                table[row, _AT["sigma_balise"]] = NAN if sigmas is None else sigmas[i]
     return table
 
 
@@ -163,7 +192,7 @@ def kernel_table(raw: FloatArray, frame: GridFrame, latitude: float) -> FloatArr
 
     Parameters
     ----------
-    raw : (m, 15) array
+    raw : (m, 19) array
         As `raw_table` gives it.
     frame : GridFrame
         The model's plane.
@@ -173,7 +202,7 @@ def kernel_table(raw: FloatArray, frame: GridFrame, latitude: float) -> FloatArr
 
     Returns
     -------
-    (m, 15) array
+    (m, 19) array
         Columns as in `railnav.navigation.columns`.
     """
     table = np.full((len(raw), c.EPOCH_SIZE), np.nan)
@@ -251,10 +280,11 @@ def body_from_imu(mounting: FloatArray) -> FloatArray:
     return np.asarray(z @ y @ x)
 
 
-def _inertial_means(imu: ImuStream, time: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Forward force, yaw rate and sigma of the latter's mean between consecutive epochs, (m,) each; NaN where not half covered."""
+def _inertial_means(imu: ImuStream, time: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Forward and side force, yaw rate and sigma of the latter's mean between consecutive epochs, (m,) each; NaN where not half covered."""
     matrix = body_from_imu(imu.mounting)
     force = imu.specific_force @ matrix[0]
+    side = imu.specific_force @ matrix[1]
     rate = imu.gyro @ matrix[2]
     usual = float(np.median(np.diff(imu.time))) if len(imu) > 1 else IMU_STEP
     width = np.minimum(np.diff(imu.time, prepend=imu.time[0] - usual), 1.5 * usual)
@@ -273,9 +303,10 @@ def _inertial_means(imu: ImuStream, time: FloatArray) -> tuple[FloatArray, Float
     with np.errstate(invalid="ignore", divide="ignore"):
         enough = covered >= 0.5 * span
         mean_force = np.where(enough, between(force * width) / covered, NAN)
+        mean_side = np.where(enough, between(side * width) / covered, NAN)
         mean_rate = np.where(enough, between(rate * width) / covered, NAN)
         # differences of neighbours hold the noise but not the turn itself
         noise = 0.5 * np.diff(rate, prepend=rate[0]) ** 2
         sigma = np.sqrt(between(noise) / count / count)
     sigma = np.where(enough & (count >= 3.0), np.maximum(sigma, 1e-6), NAN)
-    return mean_force, mean_rate, sigma
+    return mean_force, mean_side, mean_rate, sigma

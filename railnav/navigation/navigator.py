@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from railnav.errors import RunError
+from railnav.matching.network import balises_of
 from railnav.navigation import columns as c
 from railnav.navigation.engine import Engine
 from railnav.navigation.epochs import COLUMNS, IDLE_STEP, Epoch
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
     from railnav.track.model import TrackModel
 
 FloatArray = NDArray[np.float64]
+
+_NUMBERS = COLUMNS[:-2]
+_NO_BALISE = (math.nan, math.nan)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +121,8 @@ class Navigator:
         Reference point to antenna: forward, right, down, m.
     receiver : str
         Kind of GNSS receiver; one that the model's survey knows is moved to the model's datum.
+    balises : bool
+        Whether the train has a balise reader: then a balise of the model that is passed and not read is evidence.
     integrity_risk : float
         Risk, per epoch, that the along-track error exceeds the protection level.
     settings : Settings, optional
@@ -143,6 +149,7 @@ class Navigator:
         signed_odometer: bool = False,
         lever_arm_b: ArrayLike = (0.0, 0.0, 0.0),
         receiver: str = "",
+        balises: bool = False,
         integrity_risk: float = 1e-4,
         settings: Settings | None = None,
     ) -> None:
@@ -156,7 +163,9 @@ class Navigator:
             lever_arm_b=lever_arm_b,
             integrity_risk=integrity_risk,
             receiver=receiver,
+            balises=balises,
         )
+        self._balises = balises_of(model)
         self._raw = np.empty((1, len(COLUMNS)))
         self._row = np.empty((1, c.OUTPUT_SIZE))
 
@@ -192,8 +201,9 @@ class Navigator:
             raise RunError(
                 f"epoch at {epoch.time} s is not later than the one before, at {before} s", remedy="sort the epochs"
             )
-        for i, name in enumerate(COLUMNS):
+        for i, name in enumerate(_NUMBERS):
             self._raw[0, i] = getattr(epoch, name)
+        self._raw[0, len(_NUMBERS) :] = self._balises.get(epoch.balise, _NO_BALISE) if epoch.balise else _NO_BALISE
         table = self._engine.table(self._raw)
         out = self._row
         if 1.5 * IDLE_STEP < epoch.time - before < math.inf:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from railnav.errors import OffModelError
 from railnav.matching import _kernels as paths
+from railnav.matching.network import balises_of
 from railnav.navigation import columns as c
 from railnav.navigation.engine import SLOTS, Engine
 from railnav.navigation.epochs import raw_table
@@ -85,7 +86,8 @@ def navigate(
     >>> callable(navigate)
     True
     """
-    raw = raw_table(run)
+    balises = balises_of(model)
+    raw = raw_table(run, balises)
     gnss, odometer, imu = run.gnss, run.odometer, run.imu
     assert gnss is not None
     reads = "" if odometer is None or len(odometer) == 0 else "speed" if odometer.distance is None else "distance"
@@ -100,6 +102,7 @@ def navigate(
         lever_arm_b=gnss.lever_arm_b,
         integrity_risk=integrity_risk,
         receiver=gnss.receiver,
+        balises=run.balise is not None and len(balises) > 0,
         records=2 * m + 2 * SLOTS if smooth else 0,
     )
     table = engine.table(raw)

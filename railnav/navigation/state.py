@@ -31,11 +31,13 @@ class State(IntEnum):
     SPEED_ERROR = 7  # correlated part of its error, in units of its sigma
     ODOMETER_SCALE = 8  # wheel distance = (1 + scale) * distance
     GYRO_BIAS = 9  # yaw gyro, rad/s
-    ACCELEROMETER_BIAS = 10  # forward accelerometer, m/s^2; takes up the tilt of the mounting too
-    ACCELERATION = 11  # along the nose, m/s^2, Gauss-Markov; only where no accelerometer measures it
-    SPEED = 12  # along the nose, m/s: negative when backing up
-    POSITION = 13  # along the hypothesis' path, growing towards the nose, m
-    WHEEL_DISTANCE = 14  # what the odometer would read without its rounding, m
+    GYRO_TILT = 10  # what the yaw gyro feels of the vehicle's roll rate: pitch of its mounting, rad
+    SIDE_BIAS = 11  # accelerometer to the right, m/s^2; takes up the roll of the mounting too
+    ACCELEROMETER_BIAS = 12  # forward accelerometer, m/s^2; takes up the tilt of the mounting too
+    ACCELERATION = 13  # along the nose, m/s^2, Gauss-Markov; only where no accelerometer measures it
+    SPEED = 14  # along the nose, m/s: negative when backing up
+    POSITION = 15  # along the hypothesis' path, growing towards the nose, m
+    WHEEL_DISTANCE = 16  # what the odometer would read without its rounding, m
 
 
 def layout(*, imu: bool, odometer: str, speed: bool = True, map_error: bool = False) -> IntArray:
@@ -54,13 +56,13 @@ def layout(*, imu: bool, odometer: str, speed: bool = True, map_error: bool = Fa
 
     Returns
     -------
-    (15,) int array
+    (17,) int array
         Index by `State`.
 
     Examples
     --------
     >>> layout(imu=False, odometer="").tolist()
-    [0, 1, 2, 3, -1, 4, 5, 6, -1, -1, -1, 7, 8, 9, -1]
+    [0, 1, 2, 3, -1, 4, 5, 6, -1, -1, -1, -1, -1, 7, 8, 9, -1]
     """
     needed = {
         State.MAP_CROSS: map_error,
@@ -68,6 +70,8 @@ def layout(*, imu: bool, odometer: str, speed: bool = True, map_error: bool = Fa
         State.SPEED_ERROR: speed,
         State.ODOMETER_SCALE: odometer != "",
         State.GYRO_BIAS: imu,
+        State.GYRO_TILT: imu,
+        State.SIDE_BIAS: imu,
         State.ACCELEROMETER_BIAS: imu,
         State.ACCELERATION: not imu,
         State.WHEEL_DISTANCE: odometer == "distance",
@@ -136,6 +140,18 @@ class Settings:
         Least sigma of one yaw-rate mean of a moving vehicle, rad/s: hunting and track irregularity.
     gyro_scale : float
         Sigma of the yaw gyro's scale, tilt included.
+    gyro_tilt : float
+        Sigma of the unknown pitch of the IMU's mounting, rad: as the train rolls into canted curves, the yaw gyro feels it.
+    side_bias, side_walk : float
+        Accelerometer to the right: bias at the start (roll of the mounting times gravity included), m/s^2, and random walk,
+        m/s^2/sqrt(s).
+    side_noise, side_time, side_scale : float
+        Its noise on a moving vehicle (sway), m/s^2, how long that is correlated, s, and the share of what it reads that a
+        vehicle body leaning on its springs adds or takes.
+    balise_sigma : float
+        Sigma of a balise reading where none is stated, m.
+    balise_missed : float
+        Probability that a balise is passed and not read.
     curvature_sigma, curvature_shift, curvature_length : float
         Errors of the model's curvature: of its value, 1/m, of the place where it changes, m, and the length over which both are
         correlated, m.
@@ -222,6 +238,14 @@ class Settings:
     gyro_walk: float = 5e-6
     gyro_floor: float = 3e-4
     gyro_scale: float = 0.01
+    gyro_tilt: float = 5e-3
+    side_bias: float = 0.1
+    side_walk: float = 2e-4
+    side_noise: float = 0.15
+    side_time: float = 1.0
+    side_scale: float = 0.2
+    balise_sigma: float = 0.5
+    balise_missed: float = 1e-3
     curvature_sigma: float = 2e-5
     curvature_shift: float = 0.4
     curvature_length: float = 20.0

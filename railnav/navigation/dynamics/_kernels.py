@@ -13,6 +13,7 @@ from railnav.navigation.columns import (
     ACCELERATION,
     ACCELEROMETER_BIAS,
     GNSS_EAST,
+    GYRO_BIAS,
     K_ACC_SIGMA,
     K_ACC_TIME,
     K_FORCE_NOISE,
@@ -22,6 +23,7 @@ from railnav.navigation.columns import (
     K_MAP_LENGTH,
     K_ODOMETER_SLIP,
     K_ODOMETER_WALK,
+    K_SIDE_WALK,
     K_SPEED_TIME,
     K_TAG_WALK,
     KICK,
@@ -29,6 +31,7 @@ from railnav.navigation.columns import (
     ODOMETER_SCALE,
     POSITION,
     ROW_GATE,
+    SIDE_BIAS,
     SILENT_NOISE,
     SPEED,
     SPEED_ERROR,
@@ -136,10 +139,17 @@ def transition(fil, x, dt, sign, force, pull, slip, shake, step, tag, travel, st
         lead[c] = i_e
         c += 1
     root = math.sqrt(dt)
-    for which in range(3):
-        i = at[ODOMETER_SCALE + which]
+    for which in (ODOMETER_SCALE, GYRO_BIAS, SIDE_BIAS, ACCELEROMETER_BIAS):
+        i = at[which]
         if i >= 0:
-            walk = k[K_ODOMETER_WALK] if which == 0 else (k[K_GYRO_WALK] if which == 1 else k[K_FORCE_WALK])
+            if which == ODOMETER_SCALE:
+                walk = k[K_ODOMETER_WALK]
+            elif which == GYRO_BIAS:
+                walk = k[K_GYRO_WALK]
+            elif which == SIDE_BIAS:
+                walk = k[K_SIDE_WALK]
+            else:
+                walk = k[K_FORCE_WALK]
             for j in range(n):
                 Q[c, j] = 0.0
             Q[c, i] = walk * root

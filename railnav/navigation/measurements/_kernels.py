@@ -12,12 +12,16 @@ from numba import njit
 
 from railnav.matching._kernels import (
     AGREE_SINCE,
+    BY_BALISE,
     BY_COURSE,
     BY_ODOMETER,
+    BY_SIDE,
     BY_SPEED,
     BY_STANDSTILL,
     BY_YAW,
+    COUNT,
     P_CANT,
+    P_CANT_RATE,
     P_CURVATURE,
     P_D_EAST,
     P_D_NORTH,
@@ -26,6 +30,7 @@ from railnav.matching._kernels import (
     P_GRADIENT_RATE,
     P_NORTH,
     P_SIGMA_CROSS,
+    PASSED,
     POINT_SIZE,
     SIGN,
     SLIP_SINCE,
@@ -36,6 +41,9 @@ from railnav.matching._kernels import (
 from railnav.navigation.columns import (
     ACCELERATION,
     ACCELEROMETER_BIAS,
+    BALISE_OFFSET,
+    BALISE_REACH,
+    BALISE_TRACK,
     BEND_CHANGE,
     BLIND_LENGTH,
     C_RING,
@@ -57,6 +65,9 @@ from railnav.navigation.columns import (
     GNSS_EAST,
     GNSS_SPEED,
     GYRO_BIAS,
+    GYRO_TILT,
+    K_BALISE_MISSED,
+    K_BALISE_SIGMA,
     K_CORRELATED,
     K_COURSE_DOUBT,
     K_COURSE_SIGMA,
@@ -69,6 +80,9 @@ from railnav.navigation.columns import (
     K_GYRO_SCALE,
     K_ODOMETER_SIGMA,
     K_ODOMETER_SPEED,
+    K_SIDE_NOISE,
+    K_SIDE_SCALE,
+    K_SIDE_TIME,
     K_SLIP_GATE,
     K_SLIP_LONGEST,
     K_SPEED_SHARE,
@@ -83,6 +97,9 @@ from railnav.navigation.columns import (
     RING,
     ROW_GATE,
     SHAKE_SPEED,
+    SIDE,
+    SIDE_BIAS,
+    SIGMA_BALISE,
     SIGMA_EAST,
     SIGMA_NORTH,
     SIGMA_SPEED,
@@ -91,6 +108,7 @@ from railnav.navigation.columns import (
     SPEED,
     SPEED_ERROR,
     SPEED_LATENCY,
+    STRANGE_BALISE,
     TIME,
     TIME_TAG,
     W_COLUMN,
@@ -260,12 +278,22 @@ def wheel_speed_row(fil, bank, work, h, row):
 
 
 @part
-def gyro_row(fil, net, bank, work, h, row, dt):
-    """Yaw rate against curvature times speed, linearised statistically over the position's spread (five-point Gauss-Hermite)."""
+def inertial_rows(fil, net, bank, work, h, row, dt):
+    """Yaw rate and specific force to the right, linearised statistically over the position's spread (five-point Gauss-Hermite).
+
+    omega_z = v bend + b_g + tilt v phi', f_y = v^2 bend - g lean + b_y with bend = kappa cos(alpha) cos(phi) - kappa_v sin(phi) and
+    lean = cos(alpha) sin(phi) (19.3).
+    """
     k = fil.settings
     x, P_sqrt = bank.x[h], bank.P_sqrt[h]
-    h_row, probe = work.vector[W_H], work.probe
-    i_v, i_s, i_g = fil.at[SPEED], fil.at[POSITION], fil.at[GYRO_BIAS]
+    h_row, probe, f, keep, move = (
+        work.vector[W_H],
+        work.probe,
+        work.vector[W_F],
+        work.vector[W_KEEP],
+        work.vector[W_MOVE],
+    )
+    i_v, i_s, i_g, i_t, i_y = fil.at[SPEED], fil.at[POSITION], fil.at[GYRO_BIAS], fil.at[GYRO_TILT], fil.at[SIDE_BIAS]
     v = x[i_v]
     middle = x[i_s] - 0.5 * dt * v  # the mean since the epoch before belongs to the middle of the step
     spread = variance_of(P_sqrt, i_s)
@@ -273,36 +301,126 @@ def gyro_row(fil, net, bank, work, h, row, dt):
     mean = 0.0
     slope = 0.0
     square = 0.0
+    lean = 0.0
+    lean_slope = 0.0
+    lean_square = 0.0
+    roll = 0.0
     for m in range(5):
         path_point(net, bank, h, middle + GAUSS_HERMITE_NODES[m] * sd, probe)
         bend = yaw_rate_kernel(1.0, probe[P_CURVATURE], probe[P_GRADIENT], probe[P_GRADIENT_RATE], probe[P_CANT])
-        mean += GAUSS_HERMITE_WEIGHTS[m] * bend
-        slope += GAUSS_HERMITE_WEIGHTS[m] * GAUSS_HERMITE_NODES[m] * bend
-        square += GAUSS_HERMITE_WEIGHTS[m] * bend * bend
+        tilted = probe[P_CANT] / (RAIL_CENTRE_DISTANCE * math.sqrt(1.0 + probe[P_GRADIENT] * probe[P_GRADIENT]))
+        w = GAUSS_HERMITE_WEIGHTS[m]
+        mean += w * bend
+        slope += w * GAUSS_HERMITE_NODES[m] * bend
+        square += w * bend * bend
+        lean += w * tilted
+        lean_slope += w * GAUSS_HERMITE_NODES[m] * tilted
+        lean_square += w * tilted * tilted
+        roll += w * probe[P_CANT_RATE] / RAIL_CENTRE_DISTANCE
+    rest = max(square - mean * mean - slope * slope, 0.0)
+    lean_rest = max(lean_square - lean * lean - lean_slope * lean_slope, 0.0)
     slope /= sd
-    rest = max(square - mean * mean - slope * slope * spread, 0.0)
+    lean_slope /= sd
     # errors of the model's curvature are the same over some length: count them once a length, not once a row
     alike = max(1.0, k[K_CURVATURE_LENGTH] / max(abs(v) * dt, 0.1))
     rough = (k[K_CURVATURE_SIGMA] ** 2 + (slope * k[K_CURVATURE_SHIFT]) ** 2) * alike
     # where the model does not know where the track lies (a bridged tunnel) it does not know how it bends either
     poor = probe[P_SIGMA_CROSS] / (BLIND_LENGTH * BLIND_LENGTH)
     rough += poor * poor * max(1.0, BLIND_LENGTH / max(abs(v) * dt, 0.1))
-    moving = min(1.0, abs(v) / 2.0)
-    variance = (
-        row[SIGMA_YAW] ** 2 + (moving * k[K_GYRO_FLOOR]) ** 2 + v * v * (rest + rough + (k[K_GYRO_SCALE] * mean) ** 2)
-    )
-    h_row[i_s] = v * slope
-    h_row[i_v] = mean
-    h_row[i_g] = 1.0
-    innovation = row[YAW_RATE] - v * mean - x[i_g]
-    # tracks side by side differ in curvature by less than a model is wrong: only a turnout's difference is evidence
-    doubt = project(P_sqrt, h_row, work.vector[W_F]) + variance + (v * k[K_CURVATURE_DOUBT]) ** 2
-    evidence = -0.5 * (min(innovation * innovation / doubt, ROW_GATE) + math.log(doubt))
-    robust_row(x, P_sqrt, h_row, innovation, variance, work.vector[W_F], work.vector[W_KEEP], work.vector[W_MOVE])
+    if row[YAW_RATE] == row[YAW_RATE]:
+        moving = min(1.0, abs(v) / 2.0)
+        variance = (
+            row[SIGMA_YAW] ** 2
+            + (moving * k[K_GYRO_FLOOR]) ** 2
+            + v * v * (rest + rough + (k[K_GYRO_SCALE] * mean) ** 2)
+        )
+        h_row[i_s] = v * slope
+        h_row[i_v] = mean + x[i_t] * roll
+        h_row[i_g] = 1.0
+        h_row[i_t] = v * roll
+        innovation = row[YAW_RATE] - v * (mean + x[i_t] * roll) - x[i_g]
+        # tracks side by side differ in curvature by less than a model is wrong: only a turnout's difference is evidence
+        doubt = project(P_sqrt, h_row, f) + variance + (v * k[K_CURVATURE_DOUBT]) ** 2
+        credit(bank, h, BY_YAW, -0.5 * (min(innovation * innovation / doubt, ROW_GATE) + math.log(doubt)))
+        robust_row(x, P_sqrt, h_row, innovation, variance, f, keep, move)
+        h_row[i_g] = 0.0
+        h_row[i_t] = 0.0
+    if row[SIDE] == row[SIDE]:
+        v = x[i_v]
+        said = v * v * mean - k[K_GRAVITY] * lean
+        sway = k[K_SIDE_NOISE] * min(1.0, 0.1 + abs(v) / 5.0)
+        variance = sway * sway * max(1.0, k[K_SIDE_TIME] / dt) + v**4 * (rest + rough) + k[K_GRAVITY] ** 2 * lean_rest
+        variance += (k[K_SIDE_SCALE] * said) ** 2 * alike
+        h_row[i_s] = v * v * slope - k[K_GRAVITY] * lean_slope
+        h_row[i_v] = 2.0 * v * mean
+        h_row[i_y] = 1.0
+        innovation = row[SIDE] - said - x[i_y]
+        doubt = project(P_sqrt, h_row, f) + variance + (v * v * k[K_CURVATURE_DOUBT]) ** 2
+        credit(bank, h, BY_SIDE, -0.5 * (min(innovation * innovation / doubt, ROW_GATE) + math.log(doubt)))
+        robust_row(x, P_sqrt, h_row, innovation, variance, f, keep, move)
+        h_row[i_y] = 0.0
     h_row[i_s] = 0.0
     h_row[i_v] = 0.0
-    h_row[i_g] = 0.0
-    return evidence
+
+
+@part
+def balise_place(net, bank, h, track, offset, s):  # -> path coordinate of a balise nearest to s, or nan
+    """Where a hypothesis' path passes a balise."""
+    best = np.nan
+    for i in range(bank.tags[h, COUNT]):
+        if bank.track[h, i] == track:
+            local = offset if bank.way[h, i] > 0 else net.length[track] - offset
+            at = bank.begin[h, i] + local
+            if not abs(best - s) <= abs(at - s):
+                best = at
+    return best
+
+
+@part
+def balise_row(fil, net, bank, work, h, row):
+    """A balise that is read: s - s_B; a hypothesis that does not pass it loses as much as a wrong reading is improbable."""
+    k = fil.settings
+    x, P_sqrt = bank.x[h], bank.P_sqrt[h]
+    i_s = fil.at[POSITION]
+    s_b = balise_place(net, bank, h, int(row[BALISE_TRACK]), row[BALISE_OFFSET], x[i_s])
+    sigma = row[SIGMA_BALISE] if row[SIGMA_BALISE] > 0.0 else k[K_BALISE_SIGMA]
+    reach = 4.0 * math.sqrt(variance_of(P_sqrt, i_s) + sigma * sigma) + BALISE_REACH
+    if not abs(s_b - x[i_s]) <= reach:
+        credit(bank, h, BY_BALISE, STRANGE_BALISE)
+        return
+    h_row = work.vector[W_H]
+    h_row[i_s] = 1.0
+    said = robust_row(
+        x, P_sqrt, h_row, s_b - x[i_s], sigma * sigma, work.vector[W_F], work.vector[W_KEEP], work.vector[W_MOVE]
+    )
+    credit(bank, h, BY_BALISE, max(said, STRANGE_BALISE))
+    h_row[i_s] = 0.0
+    bank.info[h, PASSED] = max(bank.info[h, PASSED], s_b)
+
+
+@part
+def missed_balises(fil, net, bank, h):
+    """Balises that a hypothesis has passed for certain and that were not read: ln(1 - p_D) each (19.3)."""
+    x = bank.x[h]
+    i_s = fil.at[POSITION]
+    s = x[i_s]
+    sure = s - 4.0 * math.sqrt(variance_of(bank.P_sqrt[h], i_s)) - BALISE_REACH
+    begun = bank.info[h, PASSED]
+    if sure <= begun:
+        return
+    missed = 0
+    for i in range(bank.tags[h, COUNT]):
+        track = bank.track[h, i]
+        length = net.length[track]
+        if bank.begin[h, i] > sure or bank.begin[h, i] + length < begun:
+            continue
+        for j in range(net.balise_start[track], net.balise_start[track + 1]):
+            at = bank.begin[h, i] + (net.balise[j] if bank.way[h, i] > 0 else length - net.balise[j])
+            if begun < at <= sure:
+                missed += 1
+    bank.info[h, PASSED] = sure
+    if missed > 0:
+        credit(bank, h, BY_BALISE, missed * math.log(fil.settings[K_BALISE_MISSED]))
 
 
 @part
@@ -391,8 +509,12 @@ def motion_rows(fil, net, shared, bank, work, h, row, dt, still):
         )
         credit(bank, h, BY_STANDSTILL, rest)
         h_row[i_v] = 0.0
-    if row[YAW_RATE] == row[YAW_RATE] and at[GYRO_BIAS] >= 0 and dt > 0.0:
-        credit(bank, h, BY_YAW, gyro_row(fil, net, bank, work, h, row, dt))
+    if at[GYRO_BIAS] >= 0 and dt > 0.0 and (row[YAW_RATE] == row[YAW_RATE] or row[SIDE] == row[SIDE]):
+        inertial_rows(fil, net, bank, work, h, row, dt)
+    if row[BALISE_TRACK] >= 0.0:
+        balise_row(fil, net, bank, work, h, row)
+    if fil.reads_balises == 1:
+        missed_balises(fil, net, bank, h)
     if row[GNSS_SPEED] == row[GNSS_SPEED] and at[SPEED_LATENCY] >= 0 and shared.common[C_SPEED_STALE] == 0.0:
         speed_rows(fil, bank, work, h, row)
 
