@@ -17,7 +17,11 @@ if TYPE_CHECKING:
     from railnav.track.model import TrackModel
 
 MODEL_ENDINGS = (".gpkg", ".geojson", ".json")
+#: What a model can be converted to.
+EXPORT_ENDINGS = (*MODEL_ENDINGS, ".kml", ".xml", ".railml", ".csv", ".parquet")
 SOLUTION_ENDINGS = (".csv", ".parquet", ".gpkg", ".geojson")
+#: What a solution can be converted to besides.
+DRAWN_ENDINGS = (".kml", ".mfjson")
 PAGE_ENDINGS = (".html",)
 PICTURE_ENDINGS = (".png", ".svg", ".pdf", ".html")
 
@@ -149,6 +153,18 @@ def kind_of(path: Path) -> Kind:
     )
 
 
+def xml_kind(path: Path) -> str:
+    """Name of the root element of an XML file, by its first bytes; empty where there is none."""
+    import re
+
+    with path.open("rb") as file:
+        head = file.read(65536)
+    code = "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8"
+    text = re.sub(r"<[?!][^>]*>|<!--.*?-->", "", head.decode(code, "replace"), flags=re.DOTALL)
+    found = re.search(r"<(?:[\w.-]+:)?([\w.-]+)", text)
+    return found[1] if found else ""
+
+
 def columns(path: Path) -> set[str]:
     """Names in the header of a table, .csv or .parquet."""
     if path.suffix.lower() == ".csv":
@@ -194,11 +210,32 @@ def read_solution(path: Path) -> Solution:
 
 
 def write_model(model: TrackModel, path: Path) -> None:
-    """Write a model, .gpkg or .geojson."""
-    if path.suffix.lower() in (".geojson", ".json"):
+    """Write a model by its ending: a store, or what other programs read."""
+    ending = path.suffix.lower()
+    if ending in (".geojson", ".json"):
         from railnav.io.geojson import write_geojson
 
         write_geojson(model, path)
+        return
+    if ending == ".kml":
+        from railnav.io.kml import write_model_kml
+
+        write_model_kml(model, path)
+        return
+    if ending == ".xml":
+        from railnav.io.landxml_writer import write_landxml
+
+        write_landxml(model, path)
+        return
+    if ending == ".railml":
+        from railnav.io.railml_writer import write_railml
+
+        write_railml(model, path)
+        return
+    if ending in (".csv", ".parquet"):
+        from railnav.io.elements_writer import write_elements
+
+        write_elements(model, path)
         return
     from railnav.io.geopackage import write_model as write_geopackage
 

@@ -122,6 +122,11 @@ class Container:
             ),
         )
 
+    @property
+    def stamp(self) -> str:
+        """When the file is made, as its contents say it."""
+        return self._stamp
+
     def _reference_systems(self, crs_wkt: str) -> int:
         undefined = "undefined"
         rows: list[tuple[str, int, str, int, str, str, str]] = [

@@ -9,15 +9,24 @@ are positions; curvature steps from arc to arc.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from railnav.errors import TrackError
 from railnav.geodesy.grid import GridFrame
-from railnav.track.alignment import KnotTable
+from railnav.track.alignment import KnotTable, fit_alignment
 from railnav.units import wrap_angle
 
 FloatArray = NDArray[np.float64]
+
+#: Vertices of a line whose directions turn by less than this at each are points of a curve, not corners of a drawing, rad.
+SURVEYED_TURN = np.radians(4.0)
+#: A rounded curve stays this near to a drawing with corners, m.
+WITHIN = 0.3
+#: Vertices nearer than this are one, m.
+_SAME_VERTEX = 0.05
 
 #: Turns smaller than this are none, rad.
 _NO_TURN = 1e-9
@@ -129,6 +138,52 @@ def round_lines(
     flat = pieces.reshape(-1, 5)
     kept = flat[:, 4] > 1e-9
     return _tabulate(frame, flat[kept], owner[kept], len(lines), spacing)
+
+
+def lay_line(frame: GridFrame, point: FloatArray, spacing: float) -> KnotTable:
+    """Lay a line of vertices, a survey's or a drawing's: splined where it has no corners, else rounded.
+
+    Parameters
+    ----------
+    frame : GridFrame
+        Plane of the vertices.
+    point : (n, 3) array
+        Easting, northing, height (NaN where unknown), m; n >= 2.
+    spacing : float
+        Wanted distance between knots, m.
+
+    Returns
+    -------
+    KnotTable
+        Through the vertices (`fit_alignment`) where none turns by more than 4 degrees, else within 0.3 m of the line, with heights linear
+        between its vertices.
+
+    Raises
+    ------
+    TrackError
+        A line of no length.
+    """
+    keep = [0]
+    for i in range(1, len(point)):
+        if np.hypot(*(point[i, :2] - point[keep[-1], :2])) >= _SAME_VERTEX:
+            keep.append(i)
+    if len(keep) < 2:
+        raise TrackError("a line has no length")
+    if keep[-1] != len(point) - 1:  # the end stays, what lies upon it goes
+        keep[-1 if len(keep) > 2 or len(point) == 2 else 1] = len(point) - 1
+    point = point[keep]
+    step = np.diff(point[:, :2], axis=0)
+    turn = np.diff(np.unwrap(np.arctan2(step[:, 0], step[:, 1])))
+    if np.abs(turn).max(initial=0.0) <= SURVEYED_TURN:
+        return fit_alignment(frame, point[:, 0], point[:, 1], point[:, 2], spacing=spacing)
+    (table,) = round_lines(frame, [point[:, :2]], within=WITHIN, spacing=spacing)
+    if np.isfinite(point[:, 2]).all():
+        run = np.append(0.0, np.cumsum(np.hypot(step[:, 0], step[:, 1])))
+        height = np.interp(table.offset / table.offset[-1] * run[-1], run, point[:, 2])
+        gradient = np.gradient(height, table.offset)
+        offset = np.append(0.0, np.cumsum(np.hypot(np.diff(table.offset), np.diff(height))))
+        table = replace(table, offset=offset, height=height, gradient=gradient)
+    return table
 
 
 def _tabulate(

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from railnav.errors import InputError, ModelError, RailnavError
 from railnav.geodesy.grid import GridFrame
 from railnav.io.container import Container, Reader, bounds_of, create, decode_point, line_blob, opened, point_blobs
+from railnav.io.qgis_styles import add_styles
 from railnav.track.model import KNOT_COLUMNS, End, MilePosts, NodeKind, Nodes, TrackModel
 from railnav.track.records import ROW_SIZE, AxisRecords, Borders, ModelRecords, RecordSource, TrackRecords
 
@@ -90,6 +91,7 @@ def write_model(model: TrackModel, path: str | Path) -> None:
             _write_mileposts(container, model)
             _write_movements(container, model)
             _write_knots(container, model)
+            add_styles(container, ("tracks", "nodes", "mileposts"))
             if records is not None:
                 _write_records(container, model, records)
     except (TypeError, ValueError) as error:

@@ -30,6 +30,8 @@ LOG_FORMATS = ("nmea", "rtklib-pos", "ubx", "gpx")
 MAX_BROKEN_SHARE = 0.1
 #: Bytes read at a time.
 BLOCK = 1 << 21
+#: Fixes handed on at a time where a log is streamed.
+PART = 1 << 17
 
 #: Columns of a log, in the units of the table of formats; the kernels write them in this order.
 COLUMNS = (
@@ -204,7 +206,125 @@ def read_log(path: str | Path, format: str, *, start: datetime) -> GnssLog:  # n
     return log
 
 
-def _reader(path: Path, format: str) -> Callable[[Path, int], Found]:  # noqa: A002
+#: Takes what a reader has collected so far; it begins again after that.
+Sink = Callable[["Found"], None]
+
+
+def stream_log(
+    path: str | Path,
+    format: str,  # noqa: A002 - the key in run.toml
+    take: Callable[[IntArray, Mapping[str, FloatArray]], None],
+    *,
+    start: datetime | None = None,
+    part: int = PART,
+) -> LogSummary:
+    """Read a GNSS log piece by piece: memory does not grow with the log.
+
+    Parameters
+    ----------
+    path : path
+        The log.
+    format : str
+        "nmea", "rtklib-pos", "ubx" or "gpx".
+    take : callable
+        Called with every piece: stamps, ns since 1970 UTC, strictly growing also from piece to piece, and the columns that the piece
+        carries, in the units of the table of formats.
+    start : datetime, optional
+        When the run starts, with its time zone: gives the day where the log states none, and puts roll-overs of GPS weeks right.
+        Without it, the log must state its dates.
+    part : int
+        Fixes a piece.
+
+    Returns
+    -------
+    LogSummary
+        What was read and left out, as `read_log` gives it.
+
+    Raises
+    ------
+    RunError
+        As for `read_log`; pieces may have been taken by then.
+
+    Notes
+    -----
+    A peak of some 150 MB whatever the size of the log (`benchmarks/logs.py --stream`). Of two fixes at one instant that stand in different
+    pieces the first is kept.
+    """
+    path = Path(path)
+    _check_file(path, RunError)
+    scan = _reader(path, format)
+    relay = _Relay(take, None if start is None else gnss_time.nanoseconds(start))
+    origin = gnss_time.nanoseconds(start) if start is not None else 0
+    try:
+        found = scan(path, origin, sink=relay, part=part)
+    except OSError as error:
+        raise RunError(f"cannot be read ({error.strerror or error})", file=path) from error
+    if start is None and any("no sentence states the date" in note for note in found.notes):
+        raise RunError("no sentence states the date", file=path, remedy="say when the log starts, with --start")
+    relay(found)
+    _check_broken(found)
+    if not relay.fixes:
+        raise _no_fix(found)
+    notes = [*relay.notes, *found.notes]
+    summary = _summary(found, relay.fixes, relay.duplicates, tuple(dict.fromkeys(notes)))
+    if summary.suspicious:
+        _logger.warning("%s", summary)
+    return summary
+
+
+class _Relay:
+    """Hands pieces on in order, on UTC, one row an instant."""
+
+    def __init__(self, take: Callable[[IntArray, Mapping[str, FloatArray]], None], start: int | None) -> None:
+        self.take, self.start = take, start
+        self.shift: int | None = None
+        self.last: int | None = None
+        self.fixes = self.duplicates = 0
+        self.notes: list[str] = []
+
+    def __call__(self, found: Found) -> None:
+        stamp = found.stamp
+        if not len(stamp):
+            return
+        if self.shift is None:
+            self.shift = gnss_time.roll_overs(int(stamp[0]), self.start) if self.start is not None else 0
+            if self.shift:
+                before = gnss_time.calendar(int(stamp[0]))
+                self.notes.append(_moved(before, self.shift))
+        stamp = stamp + self.shift * gnss_time.ROLL_OVER
+        if found.gps_time:
+            stamp = gnss_time.gps_to_utc(stamp)
+        if self.last is None and self.start is not None and abs(int(stamp[0]) - self.start) > gnss_time.MAX_FROM_START:
+            cause = (
+                f"the first fix is of {gnss_time.calendar(int(stamp[0]))}, the run starts at "
+                f"{gnss_time.calendar(self.start)}"
+            )
+            raise RunError(cause, file=found.file, row=_row(found, 0), remedy="correct the start")
+        joined = stamp if self.last is None else np.append(self.last, stamp)
+        back = np.flatnonzero(joined[1:] < joined[:-1])
+        if len(back):
+            index = int(back[0]) + 1
+            before, now = (gnss_time.calendar(int(joined[i])) for i in (index - 1, index))
+            row = _row(found, index - (len(joined) - len(stamp)))
+            cause = f"time runs backwards ({now} after {before})"
+            raise RunError(cause, file=found.file, row=row, remedy="split the log where the clock was set back")
+        keep = _best(stamp, found.better) if (stamp[1:] == stamp[:-1]).any() else np.arange(len(stamp))
+        if self.last is not None:
+            keep = keep[stamp[keep] > self.last]
+        self.duplicates += len(stamp) - len(keep)
+        if not len(keep):
+            return
+        self.last = int(stamp[keep[-1]])
+        self.fixes += len(keep)
+        columns = {name: values[keep] for name, values in found.number.items() if not np.isnan(values).all()}
+        self.take(stamp[keep], columns)
+
+
+def _moved(before: str, shift: int) -> str:
+    return f"its dates ({before}) are displaced by a GPS week roll-over and were moved by {shift * 1024:+d} weeks"
+
+
+def _reader(path: Path, format: str) -> Callable[..., Found]:  # noqa: A002
     """Choose the reader; numba is not loaded for the others."""
     if format == "nmea":
         from railnav.io.nmea import scan
@@ -219,26 +339,51 @@ def _reader(path: Path, format: str) -> Callable[[Path, int], Found]:  # noqa: A
     return scan
 
 
-def settle(found: Found, start: int) -> GnssLog:
-    """Put what a reader found on the run's clock (`start` in ns since 1970), one row an instant, or refuse it."""
-    file, where = found.file, f"the first at {'byte' if found.format == 'ubx' else 'row'} {found.first_broken}"
+def _check_broken(found: Found) -> None:
+    """Refuse a log that is damaged in more than places."""
+    where = f"the first at {'byte' if found.format == 'ubx' else 'row'} {found.first_broken}"
     if found.broken > max(1.0, MAX_BROKEN_SHARE * (found.good + found.broken)):  # the last may be torn
         cause = f"{found.broken} of {found.good + found.broken} {found.unit} are broken ({where})"
         remedy = (
             "copy the log again from the receiver" if found.good else f"is this a log in the format {found.format}?"
         )
-        raise RunError(cause, file=file, remedy=remedy)
+        raise RunError(cause, file=found.file, remedy=remedy)
+
+
+def _no_fix(found: Found) -> RunError:
+    held = ", ".join(f"{count} {kind}" for kind, count in found.counts.items() if count) or f"no {found.unit}"
+    cause = f"holds no fix ({found.void} instants without one; {held})"
+    return RunError(cause, file=found.file, remedy="leave the stream out, or name the right format")
+
+
+def _summary(found: Found, fixes: int, duplicates: int, notes: tuple[str, ...]) -> LogSummary:
+    return LogSummary(
+        file=found.file,
+        format=found.format,
+        unit=found.unit,
+        fixes=fixes,
+        good=found.good,
+        broken=found.broken,
+        first_broken=found.first_broken,
+        void=found.void,
+        duplicates=found.duplicates + duplicates,
+        counts={kind: count for kind, count in found.counts.items() if count},
+        notes=notes,
+    )
+
+
+def settle(found: Found, start: int) -> GnssLog:
+    """Put what a reader found on the run's clock (`start` in ns since 1970), one row an instant, or refuse it."""
+    file = found.file
+    _check_broken(found)
     if not len(found.stamp):
-        held = ", ".join(f"{count} {kind}" for kind, count in found.counts.items() if count) or f"no {found.unit}"
-        cause = f"holds no fix ({found.void} instants without one; {held})"
-        raise RunError(cause, file=file, remedy="leave the stream out, or name the right format")
+        raise _no_fix(found)
     stamp = found.stamp
     shift = gnss_time.roll_overs(int(stamp[0]), start)
     if shift:
         before = gnss_time.calendar(int(stamp[0]))
         stamp = stamp + shift * gnss_time.ROLL_OVER
-        weeks = f"{shift * 1024:+d} weeks"
-        found.notes.append(f"its dates ({before}) are displaced by a GPS week roll-over and were moved by {weeks}")
+        found.notes.append(_moved(before, shift))
     if found.gps_time:
         stamp = gnss_time.gps_to_utc(stamp)
     if abs(int(stamp[0]) - start) > gnss_time.MAX_FROM_START:
@@ -258,24 +403,12 @@ def settle(found: Found, start: int) -> GnssLog:
         values = found.number.pop(name)
         if not np.isnan(values).all():
             number[name] = freeze(values if keep is None else values[keep])
-    duplicates, row = found.duplicates, found.row
+    duplicates, row = 0, found.row
     if keep is not None:
-        duplicates += len(stamp) - len(keep)
+        duplicates = len(stamp) - len(keep)
         stamp, row = stamp[keep], row[keep]
     number = {"time_s": freeze((stamp - start) / gnss_time.SECOND)} | number
-    summary = LogSummary(
-        file=file,
-        format=found.format,
-        unit=found.unit,
-        fixes=len(stamp),
-        good=found.good,
-        broken=found.broken,
-        first_broken=found.first_broken,
-        void=found.void,
-        duplicates=duplicates,
-        counts={kind: count for kind, count in found.counts.items() if count},
-        notes=tuple(found.notes),
-    )
+    summary = _summary(found, len(stamp), duplicates, tuple(found.notes))
     return GnssLog(Table(file, len(stamp), number, error=RunError, row_of=lambda index: int(row[index])), summary)
 
 
@@ -332,6 +465,10 @@ class Gathered:
                 column.resize(max(end, len(column) + len(column) // 2), refcheck=False)  # nobody else holds it
             column[self.length : end] = new
         self.length = end
+
+    def restart(self) -> None:
+        """Begin again with nothing; what was not taken is forgotten."""
+        self.columns, self.length = {}, 0
 
     def take(self, name: str) -> NDArray[Any] | None:
         """Give a whole column away; None where it holds nothing."""

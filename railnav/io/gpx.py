@@ -18,7 +18,7 @@ import numpy as np
 
 from railnav.errors import RunError
 from railnav.io import gnss_time
-from railnav.io.gnss_log import COLUMNS, Found, Gathered, rank
+from railnav.io.gnss_log import COLUMNS, Found, Gathered, Sink, rank
 from railnav.io.nmea import ORDER
 
 _BLOCK = 1 << 18
@@ -171,8 +171,8 @@ def _instant(text: str) -> int | None:
     return start + (second - east) * gnss_time.SECOND + fraction
 
 
-def scan(path: Path, start: int) -> Found:  # noqa: ARG001 - the points state their dates
-    """Collect the points of a track.
+def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> Found:  # noqa: ARG001 - the points state their dates
+    """Collect the points of a track; with a `sink`, every `part` points go there, and the last ones are returned.
 
     References
     ----------
@@ -185,6 +185,8 @@ def scan(path: Path, start: int) -> Found:  # noqa: ARG001 - the points state th
         with path.open("rb") as file:
             while block := file.read(_BLOCK):
                 parse(block, False)
+                if sink is not None and track.numbers.length >= part:
+                    sink(_found(track))
             parse(b"", True)
     except expat.ExpatError as error:
         cause = f"is no well-formed XML ({expat.ErrorString(error.code)})"
@@ -195,11 +197,21 @@ def scan(path: Path, start: int) -> Found:  # noqa: ARG001 - the points state th
             f"its encoding is not known ({str(error)[:80]})", file=path, remedy="save it as UTF-8"
         ) from error
     track.flush()
+    last = _found(track)
+    if track.no_height:
+        last.notes.append(f"{track.no_height} heights above sea level come without geoidheight and are left out")
+    return last
+
+
+def _found(track: _Track) -> Found:
+    """What is collected, which begins again."""
     stamp, row = track.instants.take("stamp"), track.instants.take("row")
     number = {name: values for name in COLUMNS if (values := track.numbers.take(name)) is not None}
+    track.instants.restart()
+    track.numbers.restart()
     none = np.empty(0, dtype=np.int64)
-    found = Found(
-        file=path,
+    return Found(
+        file=track.path,
         format="gpx",
         unit="points",
         stamp=none if stamp is None else stamp,
@@ -210,6 +222,3 @@ def scan(path: Path, start: int) -> Found:  # noqa: ARG001 - the points state th
         void=track.void,
         counts={"trkpt": track.count},
     )
-    if track.no_height:
-        found.notes.append(f"{track.no_height} heights above sea level come without geoidheight and are left out")
-    return found

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from railnav.io import _kernels, gnss_time
-from railnav.io.gnss_log import BLOCK, COLUMNS, ByteArray, Found, Gathered, IntArray, rank, through
+from railnav.io.gnss_log import BLOCK, COLUMNS, ByteArray, Found, Gathered, IntArray, Sink, rank, through
 
 #: Sentences that are used, in the order of their counters.
 SENTENCES = ("GGA", "GNS", "RMC", "GLL", "GST", "VTG", "ZDA", "other")
@@ -27,8 +27,10 @@ _CHECKED = re.compile(rb"\$[A-Z0-9]{3,5},[^\r\n$*]*\*[0-9A-Fa-f]{2}")
 _SHORTEST = 24  # bytes of a sentence that can open an epoch
 
 
-def scan(path: Path, start: int) -> Found:
+def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> Found:
     """Collect the fixes of a log; `start` (ns since 1970) gives the day where no sentence does.
+
+    With a `sink`, every `part` fixes go there as they come; the last ones are returned.
 
     References
     ----------
@@ -42,6 +44,39 @@ def scan(path: Path, start: int) -> Found:
     stamp = np.empty((len(out), 3), dtype=np.int64)
     numbers, stamps = Gathered(COLUMNS), Gathered(("time", "day", "row"))
     checked = _has_checksums(path)
+    clock: list[tuple[int, int]] = []  # time of day and day of the last fix that a sink took
+
+    def found() -> Found:
+        """What is collected, which begins again."""
+        row = _integers(stamps, "row")
+        of_day, day = _integers(stamps, "time"), _integers(stamps, "day")
+        number = {name: values for name in COLUMNS if (values := numbers.take(name)) is not None}
+        numbers.restart()
+        stamps.restart()
+        now = Found(
+            file=path,
+            format="nmea",
+            unit="sentences",
+            stamp=of_day,
+            number=number,
+            row=row,
+            better=lambda: rank(number, ORDER),
+            good=int(count[_kernels.GOOD]),
+            broken=int(count[_kernels.BROKEN]),
+            first_broken=int(count[_kernels.FIRST_BROKEN]) if count[_kernels.BROKEN] else None,
+            void=int(count[_kernels.VOID]),
+            duplicates=int(count[_kernels.DUPLICATES]),
+            counts={name: int(count[_kernels.KINDS + k]) for k, name in enumerate(SENTENCES)},
+        )
+        if len(of_day):
+            before = len(clock)
+            full = np.append([time for time, _ in clock], of_day).astype(np.int64)
+            day, stated = gnss_time.days(full, np.append([d for _, d in clock], day).astype(np.int64), start)
+            clock[:] = [(int(of_day[-1]), int(day[-1]))]
+            now.stamp = day[before:] * gnss_time.DAY + of_day
+            if not stated:
+                now.notes.append("no sentence states the date; the day nearest to run.start was taken")
+        return now
 
     def step(data: ByteArray, last: bool) -> int:
         used = 0
@@ -50,40 +85,20 @@ def scan(path: Path, start: int) -> Found:
             numbers.add(out[:rows])
             stamps.add(stamp[:rows])
             used += int(more)
+            if sink is not None and numbers.length >= part:
+                sink(found())
             if rows < len(out) - _kernels.SLOTS:
                 return used
 
     through(path, step)
-    row = _integers(stamps, "row")
-    of_day, day = _integers(stamps, "time"), _integers(stamps, "day")
-    number = {name: values for name in COLUMNS if (values := numbers.take(name)) is not None}
-    found = Found(
-        file=path,
-        format="nmea",
-        unit="sentences",
-        stamp=of_day,
-        number=number,
-        row=row,
-        better=lambda: rank(number, ORDER),
-        good=int(count[_kernels.GOOD]),
-        broken=int(count[_kernels.BROKEN]),
-        first_broken=int(count[_kernels.FIRST_BROKEN]) if count[_kernels.BROKEN] else None,
-        void=int(count[_kernels.VOID]),
-        duplicates=int(count[_kernels.DUPLICATES]),
-        counts={name: int(count[_kernels.KINDS + k]) for k, name in enumerate(SENTENCES)},
-    )
-    if len(of_day):
-        day, stated = gnss_time.days(of_day, day, start)
-        found.stamp = day * gnss_time.DAY + of_day
-        if not stated:
-            found.notes.append("no sentence states the date; the day nearest to run.start was taken")
+    last = found()
     if count[_kernels.NO_HEIGHT]:
-        found.notes.append(
+        last.notes.append(
             f"{count[_kernels.NO_HEIGHT]} heights above the geoid come without its separation and are left out"
         )
-    if not checked and found.good:
-        found.notes.append("its sentences have no checksums and were taken as they are")
-    return found
+    if not checked and last.good:
+        last.notes.append("its sentences have no checksums and were taken as they are")
+    return last
 
 
 def _integers(stamps: Gathered, name: str) -> IntArray:

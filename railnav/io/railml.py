@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from railnav.errors import CrsError, InputError, TrackError
 from railnav.geodesy.grid import GridFrame, choose_frame, frame_for_grid
 from railnav.io.design import LARGEST_GAP, closing, lay
-from railnav.io.drawn import round_lines
+from railnav.io.drawn import lay_line
 from railnav.io.xml_document import children, local_name, read_document
-from railnav.track.alignment import KnotTable, fit_alignment
+from railnav.track.alignment import KnotTable
 from railnav.track.assembly import TrackSection, assemble
 from railnav.track.elements import (
     ARC,
@@ -52,10 +52,6 @@ CURVES = {
 }
 #: Ends that a relation joins are one node within this, m.
 JOIN_WITHIN = 0.5
-#: Vertices of a line whose directions turn by less than this at each are points of a curve, not corners of a drawing, rad.
-SURVEYED_TURN = math.radians(4.0)
-#: The curve stays this near to a drawing with corners, m.
-WITHIN = 0.3
 _SAME_PLACE = 1e-6  # of intrinsic coordinates
 _MOST_NOTES = 20
 _GEOGRAPHIC = {"4326", "4258", "4979", "4937", "CRS84"}
@@ -543,33 +539,9 @@ def _section(reader: _Reader, frame: GridFrame, element: _Element, geographic: b
     elif element.curves:
         knots = _laid(reader, frame, element, spacing)
     if knots is None:
-        knots = drawn_line(frame, element.point, spacing)
+        knots = lay_line(frame, element.point, spacing)
     posts = _posts(reader, element, float(knots.offset[-1]))
     return TrackSection(element.track, knots, element.line, element.name, posts=posts)
-
-
-def drawn_line(frame: GridFrame, point: FloatArray, spacing: float) -> KnotTable:
-    """Lay a line of vertices (n, 3): splined where it has no corners, else rounded (and then without heights)."""
-    keep = np.append(True, np.hypot(*np.diff(point[:, :2], axis=0).T) >= 0.05)
-    keep[-1] = True
-    point = point[keep] if keep.sum() > 1 else point[[0, -1]]
-    if len(point) > 2 and not np.hypot(*(point[-1, :2] - point[-2, :2])) >= 0.05:
-        point = np.delete(point, -2, axis=0)
-    step = np.diff(point[:, :2], axis=0)
-    turn = np.diff(np.unwrap(np.arctan2(step[:, 0], step[:, 1])))
-    if np.abs(turn).max(initial=0.0) <= SURVEYED_TURN:
-        return fit_alignment(frame, point[:, 0], point[:, 1], point[:, 2], spacing=spacing)
-    if not np.hypot(*step.T).min() > 1e-3:
-        raise TrackError("a line has two vertices at one place and no length between")
-    (table,) = round_lines(frame, [point[:, :2]], within=WITHIN, spacing=spacing)
-    if np.isfinite(point[:, 2]).all():
-        run = np.append(0.0, np.cumsum(np.hypot(step[:, 0], step[:, 1])))
-        along = table.offset / table.offset[-1] * run[-1]
-        height = np.interp(along, run, point[:, 2])
-        slope = np.gradient(height, table.offset)
-        offset = np.append(0.0, np.cumsum(np.hypot(np.diff(table.offset), np.diff(height))))
-        table = replace(table, offset=offset, height=height, gradient=slope)
-    return table
 
 
 def _posts(reader: _Reader, element: _Element, length: float) -> FloatArray | None:

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from railnav.errors import InputError
 from railnav.geodesy.grid import GridFrame, choose_frame, frame_for_grid
 from railnav.io.design import lay
-from railnav.io.railml import _Reader, drawn_line
+from railnav.io.drawn import lay_line
+from railnav.io.railml import _Reader
 from railnav.io.xml_document import children, local_name
 from railnav.track.alignment import KnotTable
 from railnav.track.assembly import TrackSection, assemble
@@ -230,7 +231,7 @@ def _sections(
     if len(points) == 2 and bent:
         table = _by_radii(reader, frame, track, points, spacing)
     if table is None:
-        table = drawn_line(frame, points[:, 1:], spacing)
+        table = lay_line(frame, points[:, 1:], spacing)
         if np.isnan(table.height).any():
             table = _with_slopes(track, points, table)
     whole = assemble(frame, [TrackSection("t", table)])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from railnav.errors import RunError
 from railnav.io import _kernels, gnss_time
-from railnav.io.gnss_log import BLOCK, COLUMNS, ByteArray, Found, Gathered, IntArray, rank, through
+from railnav.io.gnss_log import BLOCK, COLUMNS, ByteArray, Found, Gathered, IntArray, Sink, rank, through
 
 #: Kinds of fix (Q), larger is better.
 ORDER = {1: 6, 2: 5, 6: 4, 4: 3, 3: 2, 5: 1}
@@ -48,8 +48,8 @@ _OTHER_COORDINATES = {
 }
 
 
-def scan(path: Path, start: int) -> Found:  # noqa: ARG001 - the file knows its dates
-    """Collect the fixes of a solution file.
+def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> Found:  # noqa: ARG001 - the file knows its dates
+    """Collect the fixes of a solution file; with a `sink`, every `part` fixes go there, and the last ones are returned.
 
     References
     ----------
@@ -68,6 +68,28 @@ def scan(path: Path, start: int) -> Found:  # noqa: ARG001 - the file knows its 
     stamp = np.empty((len(out), 2), dtype=np.int64)
     numbers, stamps = Gathered(COLUMNS), Gathered(("stamp", "row"))
 
+    def found() -> Found:
+        """What is collected, which begins again."""
+        stamped, row = _integers(stamps, "stamp"), _integers(stamps, "row")
+        number = {name: values for name in COLUMNS if (values := numbers.take(name)) is not None}
+        numbers.restart()
+        stamps.restart()
+        return Found(
+            file=path,
+            format="rtklib-pos",
+            unit="rows",
+            stamp=stamped - _JST if names[0] == "JST" else stamped,
+            number=number,
+            row=row,
+            better=lambda: rank(number, ORDER),
+            gps_time=names[0] == "GPST",
+            good=int(count[_kernels.GOOD]),
+            broken=int(count[_kernels.BROKEN]),
+            first_broken=int(count[_kernels.FIRST_BROKEN]) if count[_kernels.BROKEN] else None,
+            void=int(count[_kernels.VOID]),
+            counts={"rows": int(count[_kernels.GOOD])},
+        )
+
     def step(data: ByteArray, last: bool) -> int:
         text = data.tobytes()
         for other in _COMMENT.findall(text) if b"%" in text else ():
@@ -81,30 +103,16 @@ def scan(path: Path, start: int) -> Found:  # noqa: ARG001 - the file knows its 
             numbers.add(out[:rows, : _kernels.WIDTH])
             stamps.add(stamp[:rows])
             used += int(more)
+            if sink is not None and numbers.length >= part:
+                sink(found())
             if rows < len(out):
                 return used
 
     through(path, step)
-    stamped, row = _integers(stamps, "stamp"), _integers(stamps, "row")
-    number = {name: values for name in COLUMNS if (values := numbers.take(name)) is not None}
-    found = Found(
-        file=path,
-        format="rtklib-pos",
-        unit="rows",
-        stamp=stamped - _JST if names[0] == "JST" else stamped,
-        number=number,
-        row=row,
-        better=lambda: rank(number, ORDER),
-        gps_time=names[0] == "GPST",
-        good=int(count[_kernels.GOOD]),
-        broken=int(count[_kernels.BROKEN]),
-        first_broken=int(count[_kernels.FIRST_BROKEN]) if count[_kernels.BROKEN] else None,
-        void=int(count[_kernels.VOID]),
-        counts={"rows": int(count[_kernels.GOOD])},
-    )
+    last_part = found()
     if not height:
-        found.notes.append("its heights are above the geoid, without its separation, and are left out")
-    return found
+        last_part.notes.append("its heights are above the geoid, without its separation, and are left out")
+    return last_part
 
 
 def _integers(stamps: Gathered, name: str) -> IntArray:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from railnav.errors import InputError
 from railnav.io.atomic import atomic_path
 from railnav.io.container import bounds_of, create, opened, point_blobs
+from railnav.io.qgis_styles import add_styles
 from railnav.io.tables import PARQUET_ENDINGS, Column, Table, Words, check_table, freeze, read_table, write_table
 from railnav.navigation.solution import Mode, Solution
 
@@ -351,6 +352,7 @@ def _write_geopackage(
             bounds=bounds_of(at[0], at[1]),
             description=f"Train positions {solution.run_id}, time from {solution.start}".strip(),
         )
+        add_styles(container, (LAYER,))
         container.add_meta(
             content=CONTENT, schema_version=SCHEMA_VERSION, created_by=f"railnav {__version__}", **metadata
         )

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from railnav.io import _kernels
-from railnav.io.gnss_log import BLOCK, COLUMNS, ByteArray, Found, Gathered, IntArray, rank, through
+from railnav.io.gnss_log import BLOCK, COLUMNS, ByteArray, Found, Gathered, IntArray, Sink, rank, through
 from railnav.io.nmea import ORDER
 
 #: Names of messages that a log without NAV-PVT is likely to hold.
@@ -39,8 +39,8 @@ MESSAGES = {
 _ROOM = 1 << 14
 
 
-def scan(path: Path, start: int) -> Found:  # noqa: ARG001 - the messages state their dates
-    """Collect the fixes of a log.
+def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> Found:  # noqa: ARG001 - the messages state their dates
+    """Collect the fixes of a log; with a `sink`, every `part` fixes go there, and the last ones are returned.
 
     References
     ----------
@@ -56,6 +56,28 @@ def scan(path: Path, start: int) -> Found:  # noqa: ARG001 - the messages state 
     stamp = np.empty((_ROOM, 2), dtype=np.int64)
     numbers, stamps = Gathered(COLUMNS), Gathered(("stamp", "byte"))
 
+    def found() -> Found:
+        """What is collected, which begins again."""
+        byte, stamped = _integers(stamps, "byte"), _integers(stamps, "stamp")
+        number = {name: values for name in COLUMNS if (values := numbers.take(name)) is not None}
+        numbers.restart()
+        stamps.restart()
+        return Found(
+            file=path,
+            format="ubx",
+            unit="messages",
+            stamp=stamped,
+            number=number,
+            row=byte,
+            better=lambda: rank({name: number[name] for name in number if name != "satellites"}, ORDER),
+            good=int(count[_kernels.GOOD]),
+            broken=int(count[_kernels.BROKEN]),
+            first_broken=int(count[_kernels.FIRST_BROKEN]) if count[_kernels.BROKEN] else None,
+            void=int(count[_kernels.VOID]),
+            duplicates=int(count[_kernels.DUPLICATES]),
+            counts={_name(int(kind)): int(kinds[kind]) for kind in np.flatnonzero(kinds)},
+        )
+
     def step(data: ByteArray, last: bool) -> int:
         used = 0
         while True:
@@ -63,27 +85,13 @@ def scan(path: Path, start: int) -> Found:  # noqa: ARG001 - the messages state 
             numbers.add(out[:rows])
             stamps.add(stamp[:rows])
             used += int(more)
+            if sink is not None and numbers.length >= part:
+                sink(found())
             if rows < _ROOM - _kernels.SLOTS:
                 return used
 
     through(path, step)
-    byte = _integers(stamps, "byte")
-    number = {name: values for name in COLUMNS if (values := numbers.take(name)) is not None}
-    return Found(
-        file=path,
-        format="ubx",
-        unit="messages",
-        stamp=_integers(stamps, "stamp"),
-        number=number,
-        row=byte,
-        better=lambda: rank({name: number[name] for name in number if name != "satellites"}, ORDER),
-        good=int(count[_kernels.GOOD]),
-        broken=int(count[_kernels.BROKEN]),
-        first_broken=int(count[_kernels.FIRST_BROKEN]) if count[_kernels.BROKEN] else None,
-        void=int(count[_kernels.VOID]),
-        duplicates=int(count[_kernels.DUPLICATES]),
-        counts={_name(int(kind)): int(kinds[kind]) for kind in np.flatnonzero(kinds)},
-    )
+    return found()
 
 
 def _integers(stamps: Gathered, name: str) -> IntArray:

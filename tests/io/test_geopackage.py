@@ -171,6 +171,7 @@ def test_header_and_catalogue(tmp_path, small_model):
     assert ask(path, "SELECT srs_id FROM gpkg_spatial_ref_sys ORDER BY 1") == [(-1,), (0,), (4326,), (100001,)]
     assert ask(path, "SELECT table_name, data_type FROM gpkg_contents ORDER BY 1") == [
         ("knots", "attributes"),
+        ("layer_styles", "attributes"),
         ("mileposts", "features"),
         ("movements", "attributes"),
         ("nodes", "features"),
