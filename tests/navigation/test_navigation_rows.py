@@ -73,8 +73,8 @@ def engine(curve):
     rng = np.random.default_rng(4)
     bank.x[h] = 0.01 * rng.standard_normal(engine.states)
     bank.x[h, at[State.SPEED]] = 22.0
-    bank.x[h, at[State.POSITION]] = 1873.0
-    bank.P_sqrt[h] = 1e-4 * np.eye(engine.states)
+    bank.x[h, at[State.POSITION]] = 2100.0
+    bank.P_sqrt[h] = 1e-2 * np.eye(engine.states)
     bank.tags[h, paths.COUNT] = 1
     bank.tags[h, paths.SIGN] = 1
     common = engine.shared.common
@@ -219,6 +219,7 @@ def test_row_of_the_wheel(engine):
 def test_a_balise_places_the_train_and_a_missed_one_counts_against_it(engine):
     h, at = engine.living()[0], engine.filter.at
     i_s = at[State.POSITION]
+    engine.bank.x[h, i_s] = 1873.0
     engine.bank.P_sqrt[h, i_s, i_s] = 5.0
     row = empty()
     row[[c.TIME, c.BALISE_TRACK, c.BALISE_OFFSET, c.SIGMA_BALISE]] = 0.0, 0, 1880.0, 0.3
