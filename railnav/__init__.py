@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from railnav.navigation import Mode, Navigator, Solution, navigate
     from railnav.run import Run
     from railnav.simulation import demo_line, simulate
-    from railnav.survey import build
+    from railnav.survey import build, difference, update
     from railnav.track import TrackModel, validate
     from railnav.truth import Truth
 
@@ -58,12 +58,14 @@ _HOME = {
     "Truth": "railnav.truth",
     "build": "railnav.survey",
     "demo_line": "railnav.simulation",
+    "difference": "railnav.survey",
     "evaluate": "railnav.evaluation",
     "navigate": "railnav.navigation",
     "read_geojson": "railnav.io.geojson",
     "read_solution": "railnav.io.solution",
     "read_truth": "railnav.io.truth",
     "simulate": "railnav.simulation",
+    "update": "railnav.survey",
     "validate": "railnav.track",
 }
 
@@ -77,12 +79,14 @@ __all__ = [
     "Truth",
     "build",
     "demo_line",
+    "difference",
     "evaluate",
     "navigate",
     "read_geojson",
     "read_solution",
     "read_truth",
     "simulate",
+    "update",
     "validate",
 ]
 

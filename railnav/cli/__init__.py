@@ -21,8 +21,11 @@ VERBS: dict[str, tuple[str, str]] = {
         "Turn a track network (OpenStreetMap, GeoJSON, LandXML, elements CSV) into a reference track model.",
     ),
     "build": ("build", "Build a reference track model from survey runs."),
+    "update": ("update", "Refine a stored model with later runs; the old raw data are not needed."),
+    "diff": ("diff", "Compare two models: where did the track move, by how much, and is it significant?"),
     "navigate": ("navigate", "Place a run on a model: track, offset, speed, and how sure that is."),
     "evaluate": ("evaluate", "Compare a solution with the truth: errors along and across, track selection, integrity."),
+    "monitor": ("monitor", "Work out track geometry channels from runs, and hold them against limits."),
     "calibrate": (
         "calibrate",
         "Calibrate an inertial unit from positions: bias, scale and misalignment, with standard deviations.",
@@ -40,6 +43,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "info": ("info", "Describe a model, a run or a solution."),
     "validate": ("validate", "Check a model or a run and report every defect at once."),
     "datum": ("datum", "List datums, compare and pin their transformations, and fit one to common points."),
+    "corridor": ("corridor", "Fit a low-distortion plane to a whole line, and write it as a frame file."),
     "convert": ("convert", "Write a model or a solution in another format."),
     "view": ("view", "Draw a model or a solution as a picture or a page."),
 }

@@ -572,6 +572,17 @@ class ChangeTest:
     difference: FloatArray
     sigma: FloatArray
 
+    @property
+    def excess(self) -> float:
+        """How much more the surveys differ than they state: upper quartile of T over that of chi-square, at least 1.
+
+        Most windows of a line have not moved. Where the factor is well above 1, the surveys' errors are not as their covariances say,
+        and a second test with ``variance_factor=excess`` allows for it.
+        """
+        from scipy.stats import chi2
+
+        return max(1.0, float(np.quantile(self.statistic, 0.75) / chi2.ppf(0.75, self.dof)))
+
     def nodes(self, *, margin: int = 10) -> BoolArray:
         """Nodes of the stretches that moved, and `margin` nodes beyond each end.
 
@@ -601,6 +612,7 @@ def change_test(
     step: int = 10,
     components: ArrayLike | None = None,
     false_alarm: float = 1e-3,
+    variance_factor: float = 1.0,
 ) -> ChangeTest:
     """Test whether two independent surveys of the same nodes differ, window by window, before they are merged.
 
@@ -622,6 +634,8 @@ def change_test(
         What of the states is compared, e.g. the unit vectors across and up; all of it by default.
     false_alarm : float
         Probability that any window of the line alarms though nothing moved (Bonferroni over the windows).
+    variance_factor : float
+        What both covariances are multiplied by, where the surveys are known to err more than they state (`ChangeTest.excess`).
 
     Returns
     -------
@@ -673,13 +687,15 @@ def change_test(
     if first[-1] != N - 1 - reach:
         first = np.append(first, N - 1 - reach)  # the last nodes are tested as well
     nodes = first[:, None] + spacing * np.arange(window)  # (W, window)
-    sigma = _window_covariance(old, nodes, E) + _window_covariance(new, nodes, E)
+    if not variance_factor > 0:
+        raise EstimationError(f"the variance factor is {variance_factor}; it must be positive")
+    sigma = variance_factor * (_window_covariance(old, nodes, E) + _window_covariance(new, nodes, E))
     difference = np.asarray(np.einsum("kij,kj->ki", E, new.state - old.state))
     delta = difference[nodes].reshape(len(first), window * c)
     statistic = np.einsum("wi,wi->w", delta, np.linalg.solve(sigma, delta[:, :, None])[:, :, 0])
     limit = chi_square_limit(window * c, false_alarm / len(first))
     changed = np.asarray(statistic > limit)
-    variance = np.einsum("kij,kjl,kil->ki", E, old.covariance + new.covariance, E)
+    variance = variance_factor * np.einsum("kij,kjl,kil->ki", E, old.covariance + new.covariance, E)
     return ChangeTest(
         first=first,
         last=nodes[:, -1],
@@ -687,7 +703,9 @@ def change_test(
         dof=window * c,
         limit=limit,
         changed=changed,
-        stretches=_stretches(old, new, E, difference, first[changed], nodes[changed, -1], max(spacing // 2, 1)),
+        stretches=_stretches(
+            old, new, E, difference, first[changed], nodes[changed, -1], max(spacing // 2, 1), variance_factor
+        ),
         difference=difference,
         sigma=np.asarray(np.sqrt(variance)),
     )
@@ -701,6 +719,7 @@ def _stretches(
     first: IntArray,
     last: IntArray,
     spacing: int,
+    factor: float,
 ) -> tuple[tuple[int, int], ...]:
     """Stretch of each group of overlapping windows without which the rest agrees best."""
     groups: list[list[int]] = []
@@ -717,7 +736,7 @@ def _stretches(
         if nodes[-1] != b:
             nodes = np.append(nodes, b)
         w = len(nodes)
-        sigma = (_window_covariance(old, nodes[None], E) + _window_covariance(new, nodes[None], E))[0]
+        sigma = factor * (_window_covariance(old, nodes[None], E) + _window_covariance(new, nodes[None], E))[0]
         delta = difference[nodes].ravel()
         best, stretch = np.inf, (a, b)
         for i in range(w):
@@ -746,6 +765,69 @@ def _window_covariance(solution: ChainSolution, nodes: IntArray, E: FloatArray) 
         for k in range(nodes[0, a + 1] - nodes[0, a] - 2, -1, -1):
             product = G[nodes[:, a] + k] @ product
         across.append(product)
+    for b in range(w):
+        cross = P[nodes[:, b]]
+        for a in range(b, -1, -1):
+            if a < b:
+                cross = across[a] @ cross
+            block = E[nodes[:, a]] @ cross @ np.swapaxes(E[nodes[:, b]], 1, 2)
+            out[:, a, :, b, :] = block
+            out[:, b, :, a, :] = np.swapaxes(block, 1, 2)
+    return out.reshape(W, w * c, w * c)
+
+
+def windows(solution: ChainSolution, nodes: ArrayLike, components: ArrayLike | None = None) -> FloatArray:
+    """Joint covariances of the states at windows of nodes, cov(x_i, x_j) = G_i ... G_(j-1) P_j.
+
+    Parameters
+    ----------
+    solution : ChainSolution
+        With covariances.
+    nodes : (W, w) integer array
+        Nodes of each window, growing.
+    components : (c, n) array, optional
+        What of the states; the first number by default.
+
+    Returns
+    -------
+    (W, w c, w c) array
+        Node by node, component by component.
+
+    Raises
+    ------
+    EstimationError
+        The chain was solved without covariances, or nodes do not grow.
+
+    References
+    ----------
+    Specification rail 15.3.
+    """
+    k = np.asarray(nodes, np.int64)
+    n = solution.state.shape[1]
+    if solution.covariance is None:
+        raise EstimationError("the chain is needed with covariances; solve_chain(..., covariance=True) gives them")
+    if k.ndim != 2 or k.min() < 0 or k.max() >= len(solution.state) or (np.diff(k, axis=1) <= 0).any():
+        raise EstimationError("nodes of a window must grow and lie within the chain")
+    E = np.eye(1, n) if components is None else as_floats("components", components)
+    return _ragged_covariance(solution, k, np.broadcast_to(E, (len(solution.state), *E.shape)))
+
+
+def _ragged_covariance(solution: ChainSolution, nodes: IntArray, E: FloatArray) -> FloatArray:
+    """The same for windows whose nodes are not equally far apart."""
+    assert solution.covariance is not None
+    P = solution.covariance
+    W, w = nodes.shape
+    n, c = P.shape[1], E.shape[1]
+    G = -np.linalg.solve(solution.records[:, :, :n], solution.records[:, :, n : 2 * n])
+    across = []
+    for a in range(w - 1):
+        product = np.broadcast_to(np.eye(n), (W, n, n)).copy()
+        far = nodes[:, a + 1] - nodes[:, a]
+        for k in range(int(far.max())):
+            on = k < far
+            product[on] = product[on] @ G[nodes[on, a] + k]
+        across.append(product)
+    out = np.empty((W, w, c, w, c))
     for b in range(w):
         cross = P[nodes[:, b]]
         for a in range(b, -1, -1):

@@ -24,6 +24,7 @@ from railnav.survey.nominal import course, lines, smooth_course
 from railnav.survey.offsets import Offsets, differences, settle
 from railnav.survey.stored import keep_build
 from railnav.survey.surveyed import Surveyed
+from railnav.survey.tabulation import tabulate
 from railnav.survey.vertical import Heights, estimate_heights, measured_cant
 
 if TYPE_CHECKING:
@@ -121,7 +122,7 @@ def build(
     tell = progress or _silent
     _refuse_strangers(runs)
     frame = _frame(runs, crs, zone_width, ellipsoid)
-    survey = _gathered(runs, frame, tell)
+    survey = gathered(runs, frame, tell)
     tracks = _laid_out(survey)
     tell("lay out", 1, 1)
     tracks, offsets = _compared(survey, tracks)
@@ -174,7 +175,7 @@ def _frame(runs: Sequence[Run], crs: str | None, zone_width: Literal[3, 6], elli
     return choose_frame(latitude, longitude, crs=crs, zone_width=zone_width, ellipsoid=ellipsoid)
 
 
-def _gathered(runs: Sequence[Run], frame: GridFrame, tell: Progress) -> report.Survey:
+def gathered(runs: Sequence[Run], frame: GridFrame, tell: Progress) -> report.Survey:
     """Bring all runs into the grid; a run with too few fixes stays out, unless it is the only one."""
     fixes: list[Fixes] = []
     courses: list[FloatArray] = []
@@ -309,44 +310,22 @@ def _assembled(
     tables: list[KnotTable] = []
     for i, (t, h) in enumerate(zip(tracks, heights, strict=True)):
         tell("tabulate", i, len(tracks))
-        tables.append(_knots(t, offsets, h, frame, spacing))
+        assert t.estimate is not None
+        tables.append(
+            tabulate(
+                t.nominal,
+                t.axis,
+                t.estimate.covariance[:, 0, 0],
+                offsets.common(t.runs),
+                None if h is None else (h.height, h.variance),
+                measured_cant(t),
+                frame,
+                spacing,
+            )
+        )
     tell("tabulate", len(tracks), len(tracks))
     sections = [TrackSection(t.name, table) for t, table in zip(tracks, tables, strict=True)]
     text = report.compose(survey, tracks, offsets, heights, up, tables)
     records = keep_build(survey, tracks, offsets, heights, up)
     provenance = {"made_by": "railnav build", "build": text}
     return assemble(frame, sections, provenance=provenance, record_source=lambda: records)
-
-
-def _knots(t: Surveyed, offsets: Offsets, heights: Heights | None, frame: GridFrame, spacing: float) -> KnotTable:
-    """Lay the final curve of one track and give each knot its covariance."""
-    from railnav.track.alignment import fit_alignment
-
-    assert t.estimate is not None
-    e, n = t.nominal.normal
-    across = t.estimate.covariance[:, 0, 0]
-    # a shift of the frame moves the axis along as well: its part along, and what that has in common with the part across
-    shift = offsets.common(t.runs)
-    along = (t.nominal.tangent_e, t.nominal.tangent_n)
-    common = [
-        a[0] * (shift[0, 0] * b[0] + shift[0, 1] * b[1]) + a[1] * (shift[1, 0] * b[0] + shift[1, 1] * b[1])
-        for a, b in ((along, along), (along, (e, n)))
-    ]
-    lengthwise, mixed = common
-    mixed = np.clip(mixed, -0.99 * np.sqrt(across * lengthwise), 0.99 * np.sqrt(across * lengthwise))
-    covariance = np.full((len(e), 6), np.nan)
-    covariance[:, 0] = across * e * e + lengthwise * n * n - 2.0 * mixed * e * n
-    covariance[:, 1] = across * e * n - lengthwise * e * n + mixed * (e * e - n * n)
-    covariance[:, 3] = across * n * n + lengthwise * e * e + 2.0 * mixed * e * n
-    if heights is not None:
-        covariance[:, [2, 4]] = 0.0
-        covariance[:, 5] = heights.variance
-    return fit_alignment(
-        frame,
-        t.nominal.easting + t.axis * e,
-        t.nominal.northing + t.axis * n,
-        None if heights is None else heights.height,
-        cant=measured_cant(t),
-        covariance_g=covariance,
-        spacing=spacing,
-    )

@@ -28,8 +28,9 @@ REASONS = (
     "on another track here",
     "beyond the end of the track",
     "before or after turning back",
+    "contradicts the other runs here",
 )
-USED, STATED_SIGMA, JUMP, FAR, GROSS, OTHER_TRACK, BEYOND, TURNED = range(len(REASONS))
+USED, STATED_SIGMA, JUMP, FAR, GROSS, OTHER_TRACK, BEYOND, TURNED, CONTRADICTS = range(len(REASONS))
 
 #: A fix whose stated sigma is more than this times the run's median is left out: the receiver itself doubts it.
 SIGMA_RATIO = 5.0

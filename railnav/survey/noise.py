@@ -106,6 +106,23 @@ def error_models(samples: Sequence[Sample], stated: dict[str, float]) -> tuple[d
     return models, assumed
 
 
+def error_model_against(samples: Sequence[Sample], receiver: str) -> ErrorModel | None:
+    """Error model of a receiver from its distances to an axis that is known without it; None where there are too few.
+
+    The axis stands for a second run that errs by nothing, so the fit's even share of the difference is half of the power.
+    """
+    paired = []
+    for sample in samples:
+        rows = [k for k, name in enumerate(sample.receiver) if name == receiver]
+        for k in rows:
+            value = np.stack([sample.value[k], np.where(np.isfinite(sample.value[k]), 0.0, np.nan)])
+            paired.append(
+                Sample(value, sample.time[[k, k]], sample.count[[k, k]], sample.rate[[k, k]], (receiver, "the axis"))
+            )
+    equations = _equations(paired, (receiver, "the axis"))
+    return _fit(*equations).scaled(float(np.sqrt(2.0))) if len(equations[1]) else None
+
+
 def run_models(sample: Sample, models: dict[str, ErrorModel]) -> list[ErrorModel]:
     """Error model of each run of a track: its receiver's, larger or smaller as its differences to the other runs say.
 

@@ -119,6 +119,24 @@ def curve(easting: FloatArray, northing: FloatArray, step: float) -> Nominal:
     )
 
 
+def through(easting: FloatArray, northing: FloatArray, step: float) -> Nominal:
+    """Lay a C2 curve through nodes that lie about `step` metres apart, and keep these nodes."""
+    from scipy.interpolate import CubicSpline
+
+    p = np.append(0.0, np.cumsum(np.hypot(np.diff(easting), np.diff(northing))))
+    spline = CubicSpline(p, np.column_stack([easting, northing]))
+    d1, d2 = spline(p, 1), spline(p, 2)
+    size = np.hypot(d1[:, 0], d1[:, 1])
+    return Nominal(
+        step=step,
+        easting=np.array(easting),
+        northing=np.array(northing),
+        tangent_e=d1[:, 0] / size,
+        tangent_n=d1[:, 1] / size,
+        curvature=(d2[:, 0] * d1[:, 1] - d1[:, 0] * d2[:, 1]) / size**3,
+    )
+
+
 def course(fixes: Fixes) -> FloatArray:
     """Points of a run about 30 m apart, (k, 2), without the wandering at stops and without folds.
 

@@ -176,7 +176,7 @@ def _run(
         "direction": f.run.direction,
         "start": f.run.start.isoformat(),
         "tracks": [home[0].name] if home is not None else [],
-        "fixes": {"total": len(f), "used": int(np.count_nonzero(f.reason == USED)), "rejected": _rejected(f)},
+        "fixes": {"total": len(f), "used": int(np.count_nonzero(f.reason == USED)), "rejected": rejected(f)},
     }
     sigma = offsets.sigma(i)
     has_up = up is not None and bool(np.isfinite(f.height).any())
@@ -237,7 +237,8 @@ def _refused(run: Run, cause: str) -> dict[str, Any]:
     }
 
 
-def _rejected(f: Fixes) -> dict[str, Any]:
+def rejected(f: Fixes) -> dict[str, Any]:
+    """Fixes of a run that were not used, by reason: how many, and the worst."""
     out: dict[str, Any] = {}
     for code, reason in enumerate(REASONS):
         rows = np.flatnonzero(f.reason == code)

@@ -114,7 +114,12 @@ def keep_build(
         up=None if up is None else _borders([t.name for t, _ in high], [h.runs for _, h in high], names, up),
         receivers=told,
         runs=tuple(
-            {"id": f.run.id, "start": f.run.start.isoformat(), "tracks": [home[i]] if i in home else []}
+            {
+                "id": f.run.id,
+                "start": f.run.start.isoformat(),
+                "direction": f.run.direction,
+                "tracks": [home[i]] if i in home else [],
+            }
             for i, f in enumerate(survey.fixes)
         ),
     )

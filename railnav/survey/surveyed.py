@@ -25,6 +25,8 @@ BoolArray = NDArray[np.bool_]
 REACH = 60.0
 #: A single run's way beyond all others is cut when no longer than this, m.
 LONE_END = 500.0
+#: Fixes of such a length at an end that lie beyond a gap of this length, m, are cut off with it.
+ISLAND_GAP = 200.0
 #: Beyond this many sigma a node mean begins to lose weight (Huber).
 HUBER = 2.5
 #: A fix this many sigma off the axis is a gross error.
@@ -113,6 +115,7 @@ def cut_ends(track: Surveyed) -> Surveyed:
         short = LONE_END / track.nominal.step
         a = first[1] if first[1] - a <= short else a
         b = last[-2] if b - last[-2] <= short else b
+    a, b = _mainland(track, a, b)
     if (a == 0 and b == N - 1) or b - a < 3:
         return track
     keep = slice(a, b + 1)
@@ -134,6 +137,21 @@ def cut_ends(track: Surveyed) -> Surveyed:
         noise=track.noise[a:b],
         estimate=e,
     )
+
+
+def _mainland(track: Surveyed, a: int, b: int) -> tuple[int, int]:
+    """Ends a..b of a track without short islands of fixes beyond a gap: a curve across the gap to them is anybody's guess."""
+    nodes = np.flatnonzero(track.profile.present[:, a : b + 1].any(axis=0)) + a
+    gap, island = ISLAND_GAP / track.nominal.step, LONE_END / track.nominal.step
+    while len(nodes) > 3:
+        breaks = np.flatnonzero(np.diff(nodes) > gap)
+        if len(breaks) and nodes[breaks[0]] - nodes[0] < island and len(nodes) - breaks[0] > 3:
+            nodes = nodes[breaks[0] + 1 :]
+        elif len(breaks) and nodes[-1] - nodes[breaks[-1] + 1] < island and breaks[-1] > 2:
+            nodes = nodes[: breaks[-1] + 1]
+        else:
+            break
+    return (int(nodes[0]), int(nodes[-1])) if len(nodes) else (a, b)
 
 
 def middle_axis(track: Surveyed, offset: FloatArray, spread: float, step: float, smooth: float) -> FloatArray:
@@ -198,6 +216,7 @@ def reduced(track: Surveyed, offset: FloatArray, step: float, receivers: list[st
 
 def relaid(track: Surveyed, fixes: Sequence[Fixes], *, step: float | None = None) -> Surveyed:
     """Make the estimated axis the nominal curve and lay the runs anew."""
+    track = cut_ends(track)
     nominal = track.nominal.shifted(track.axis)
     if step is not None:
         nominal = nominal.resampled(step)

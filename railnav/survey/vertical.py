@@ -153,6 +153,17 @@ def _rows(P: Profiles, rows: IntArray) -> Profiles:
     )
 
 
+def with_heights(track: Surveyed, base: FloatArray) -> Surveyed | None:
+    """The runs of a track that have heights, as distances above `base` (N,), m, in the place of those to the right; None without."""
+    value = track.profile.height - base
+    rows = np.flatnonzero(np.isfinite(value).any(axis=1))
+    if not len(rows):
+        return None
+    profile = replace(_rows(track.profile, rows), right=value[rows])
+    laid = [track.laid[k] for k in rows]
+    return replace(track, runs=tuple(track.runs[k] for k in rows), laid=laid, profile=profile, axis=np.zeros(len(base)))
+
+
 def _reached(has: NDArray[np.bool_], track: Surveyed) -> NDArray[np.bool_]:
     from scipy.ndimage import maximum_filter1d
 
