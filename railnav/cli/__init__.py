@@ -22,7 +22,7 @@ VERBS: dict[str, tuple[str, str]] = {
     ),
     "build": ("build", "Build a reference track model from survey runs."),
     "update": ("update", "Refine a stored model with later runs; the old raw data are not needed."),
-    "diff": ("diff", "Compare two models: where did the track move, by how much, and is it significant?"),
+    "diff": ("diff", "Compare two models: where the track moved, by how much, and how sure that is."),
     "navigate": ("navigate", "Place a run on a model: track, offset, speed, and how sure that is."),
     "evaluate": ("evaluate", "Compare a solution with the truth: errors along and across, track selection, integrity."),
     "monitor": ("monitor", "Work out track geometry channels from runs, and hold them against limits."),

@@ -27,10 +27,11 @@ from railnav.cli._verb import PATH, json_option
 )
 @json_option
 def command(old: Path, new: Path, output: Path | None, step: float, false_alarm: float, as_json: bool) -> None:
-    """Compare two models: where did the track move, by how much, and is it significant?
+    """Compare two models: where the track moved, by how much, and how sure that is.
 
-    Slews are positive to the right as the offset of OLD grows, lifts upwards; sigmas are those of the difference. A shift of one datum against the other is
-    told apart. The list of moved stretches comes from the models' survey records where both carry them.
+    Slews are positive to the right as the offset of OLD grows, lifts upwards; sigmas are those of the difference. A
+    shift of one datum against the other is told apart. The list of moved stretches comes from the models' survey
+    records where both carry them.
 
     \b
     Example:
