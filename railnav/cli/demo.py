@@ -14,6 +14,7 @@ import click
 from railnav.cli._verb import PATH, json_option
 
 if TYPE_CHECKING:
+    from railnav.evaluation import AxisError
     from railnav.run import Progress, Run
     from railnav.track.model import TrackModel
     from railnav.truth import Truth
@@ -150,7 +151,7 @@ def _demo(
     """Go the whole way in a folder; returns facts for JSON, and lines for people."""
     from dataclasses import replace
 
-    from railnav.evaluation import evaluate
+    from railnav.evaluation import axis_error, evaluate, truth_on
     from railnav.io.geojson import write_geojson
     from railnav.io.run import write_run
     from railnav.io.truth import write_truth
@@ -171,7 +172,7 @@ def _demo(
     watch.done("build the reference track model")
     model.to_file(folder / "line.gpkg")
     write_geojson(model, folder / "line.geojson")
-    truth = _truth_on(model, simulated_truth)
+    truth = truth_on(model, simulated_truth)
     write_truth(truth, folder / "truth.csv")
     watch.done("write the model, and the truth on it")
     compiled(tell)
@@ -183,7 +184,7 @@ def _demo(
     smoothed.to_file(folder / "smoothed.csv")
     evaluation, evaluation_smoothed = evaluate(solution, truth, model=model), evaluate(smoothed, truth, model=model)
     watch.done("evaluate")
-    axis = _axis_error(model, reference)
+    axis = axis_error(model, reference)
     page = demo_page(
         model=model,
         surveys=surveys,
@@ -203,7 +204,7 @@ def _demo(
         "seed": seed,
         "folder": shown,
         "report": shown / REPORT,
-        "model": {"tracks": len(model.track_id), "length_m": float(model.lengths.sum()), **axis},
+        "model": {"tracks": len(model.track_id), "length_m": float(model.lengths.sum()), **_axis(axis)},
         "evaluation": evaluation.to_dict(),
         "evaluation_smoothed": evaluation_smoothed.to_dict(),
         "steps_s": {name: round(seconds, 2) for name, seconds in watch.steps},
@@ -250,72 +251,8 @@ def _simulated(seed: int, tell: Progress | None) -> tuple[TrackModel, list[Run],
     return reference, surveys, service, truth
 
 
-def _truth_on(model: TrackModel, truth: Truth) -> Truth:
-    """Express a truth on a model built anew, whose track has another name: its foot points on the track the train ran on.
-
-    That track is the one nearest to most of the true positions; true positions beyond its ends are left out.
-    """
-    import numpy as np
-
-    from railnav.errors import OffModelError
-    from railnav.truth import Truth
-
-    easting, northing, _ = model.frame.to_grid(truth.latitude, truth.longitude)
-    near = [model.locate(float(e), float(n), within=20.0) for e, n in zip(easting, northing, strict=True)]
-    votes = [candidates[0].track for candidates in near if candidates]
-    if not votes:
-        raise OffModelError("the service run never touches the model built from the survey")
-    track = max(set(votes), key=votes.count)
-    feet = [next((c.offset for c in candidates if c.track == track), np.nan) for candidates in near]
-    last = model.length(track)
-    rows = np.flatnonzero([0.0 < foot < last for foot in feet])
-    return Truth(
-        track_id=(track,),
-        time=truth.time[rows],
-        track=np.zeros(len(rows), np.int64),
-        offset=np.asarray(feet)[rows],
-        speed=truth.speed[rows],
-        latitude=truth.latitude[rows],
-        longitude=truth.longitude[rows],
-        height=truth.height[rows],
-        heading=truth.heading[rows],
-        simulated=True,
-    )
-
-
-def _axis_error(model: TrackModel, reference: TrackModel) -> dict[str, float | None]:
-    """How far the built axes lie from the true ones, every 20 m: under open sky, and in the tunnels, m."""
-    import numpy as np
-
-    latitude, longitude, _ = model.frame.to_geodetic(model.easting, model.northing)
-    easting, northing, _ = reference.frame.to_grid(latitude, longitude)
-    open_sky: list[float] = []
-    tunnel: list[float] = []
-    for track in model.track_id:
-        knots = model.knots(track)
-        near = [
-            reference.locate(float(easting[k]), float(northing[k]), within=20.0)
-            for k in range(knots.start, knots.stop, 20)
-        ]
-        sides = [candidates[0].track[:3] for candidates in near if candidates]  # main track: "77R" or "77L"
-        side = max(set(sides), key=sides.count) if sides else ""
-        for candidates in near:
-            foot = next((c for c in candidates if c.track.startswith(side)), None)
-            if foot is not None:
-                (tunnel if _covered(reference, foot.track, foot.offset) else open_sky).append(foot.distance)
-    return {
-        "axis_rms_m": float(np.sqrt(np.mean(np.square(open_sky)))) if open_sky else None,
-        "axis_max_m": max(open_sky, default=None),
-        "axis_tunnel_max_m": max(tunnel, default=None),
-    }
-
-
-def _covered(reference: TrackModel, track: str, offset: float, margin: float = 60.0) -> bool:
-    """Whether a place lies in a tunnel, or so near its mouth that the receiver has not found the satellites again."""
-    return any(
-        tunnel["track"] == track and tunnel["from_m"] - margin <= offset <= tunnel["to_m"] + margin
-        for tunnel in reference.provenance.get("tunnels", [])
-    )
+def _axis(found: AxisError) -> dict[str, float | None]:
+    return {"axis_rms_m": found.rms, "axis_max_m": found.max, "axis_tunnel_max_m": found.tunnel_max}
 
 
 def next_commands(folder: Path) -> list[str]:

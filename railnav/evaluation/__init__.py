@@ -1,5 +1,6 @@
 """Evaluation: a solution beside the truth. Errors along and across, track selection, consistency, integrity."""
 
+from railnav.evaluation.axis import AxisError, axis_error, truth_on
 from railnav.evaluation.comparison import Comparison, compare
 from railnav.evaluation.consistency import Consistency, consistency, effective_samples, pooled
 from railnav.evaluation.jumps import Jump, Jumps, find_jumps
@@ -16,6 +17,7 @@ from railnav.evaluation.scores import (
 )
 
 __all__ = [
+    "AxisError",
     "CoastingStretch",
     "Comparison",
     "Consistency",
@@ -28,6 +30,7 @@ __all__ = [
     "Statistics",
     "TrackSelection",
     "WrongStretch",
+    "axis_error",
     "compare",
     "consistency",
     "effective_samples",
@@ -37,4 +40,5 @@ __all__ = [
     "pooled_reliability",
     "reliability",
     "truth_as_solution",
+    "truth_on",
 ]

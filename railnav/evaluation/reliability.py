@@ -134,7 +134,15 @@ def reliability(
         rows = int(inside.sum())
         if rows:
             classes.append(
-                _class(low, high, rows, max(1.0, rows * share), float(p[inside].mean()), float(hit[inside].mean()), confidence)
+                _class(
+                    low,
+                    high,
+                    rows,
+                    max(1.0, rows * share),
+                    float(p[inside].mean()),
+                    float(hit[inside].mean()),
+                    confidence,
+                )
             )
     return Reliability(tuple(classes), len(p), float((residual**2).mean()), confidence)
 

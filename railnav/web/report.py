@@ -15,7 +15,7 @@ from railnav.web import figures, words
 from railnav.web.page import Card, Code, Figure, Section, Table, Warnings, page
 
 if TYPE_CHECKING:
-    from railnav.evaluation import Evaluation
+    from railnav.evaluation import AxisError, Evaluation
     from railnav.navigation.solution import Solution
     from railnav.run import Run
     from railnav.track.model import TrackModel
@@ -496,7 +496,7 @@ def demo_page(
     truth: Truth,
     evaluation: Evaluation,
     smoothed: Evaluation,
-    axis_error: Mapping[str, float | None],
+    axis_error: AxisError,
     steps: Sequence[tuple[str, float]],
     commands: Sequence[str],
     seed: int,
@@ -515,8 +515,8 @@ def demo_page(
     truth : Truth
     evaluation, smoothed : Evaluation
         Of the filtered and of the smoothed solution.
-    axis_error : mapping
-        `axis_rms_m` and `axis_max_m` of the built axis against the true one under open sky, `axis_tunnel_max_m` in tunnels.
+    axis_error : AxisError
+        Of the built axis against the true one.
     steps : sequence of (name, seconds)
         What was done, and how long it took.
     commands : sequence of str
@@ -542,17 +542,17 @@ def demo_page(
     lead = [
         f"Everything on this page is simulated. A survey car ran {words.count(len(surveys), 'time')} over a fictitious double line; "
         f"from its {fixes:,} satellite fixes railnav built a reference track model of {words.count(len(model.track_id), 'track')}, "
-        f"{words.length(float(model.lengths.sum()), 4)} in all. Its axis lies within {words.length(axis_error.get('axis_rms_m'), 2)} "
+        f"{words.length(float(model.lengths.sum()), 4)} in all. Its axis lies within {words.length(axis_error.rms, 2)} "
         f"(RMS) of the true one under open sky; in the tunnels, where the survey saw no satellites, it is off by up to "
-        f"{words.length(axis_error.get('axis_tunnel_max_m'), 2)}, and says so. A train in service then ran {words.length(length)} over "
+        f"{words.length(axis_error.tunnel_max, 2)}, and says so. A train in service then ran {words.length(length)} over "
         f"the model with an everyday receiver, an odometer and an inertial sensor, {words.count(len(silent), 'time')} without satellites.",
         *evaluation_words(evaluation),
     ]
     cards = [
         Card(
             "Axis of the built model",
-            words.length(axis_error.get("axis_rms_m"), 2),
-            f"RMS from the true axis under open sky; worst: {words.length(axis_error.get('axis_max_m'), 2)}",
+            words.length(axis_error.rms, 2),
+            f"RMS from the true axis under open sky; worst: {words.length(axis_error.max, 2)}",
         ),
         *evaluation_cards(evaluation),
     ]

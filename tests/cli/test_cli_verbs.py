@@ -17,7 +17,7 @@ from railnav.evaluation import truth_as_solution
 from railnav.io.geopackage import read_model
 from railnav.io.run import read_run
 from railnav.io.truth import read_truth
-from railnav.simulation import PHONE, Leg, demo_line, simulate
+from railnav.simulation import demo_line
 
 
 @pytest.fixture
@@ -239,44 +239,6 @@ def test_the_commands_of_the_issue_on_the_sample_run(
     found = run_json("evaluate", "s.csv", str(sample / "truth.csv"))
     assert found["selection"]["rate"] == 1.0
     assert found["along"]["rms"] < 1.0
-
-
-def test_a_truth_moves_to_a_model_built_anew() -> None:
-    """On the very model it was simulated on, under another name, the truth is what it was."""
-    from dataclasses import replace
-
-    from railnav.cli.demo import _truth_on
-    from railnav.errors import OffModelError
-
-    model = demo_line(spacing=5.0)
-    _, truth = simulate(model, Leg(("77R-03",), start=100.0, finish=900.0), seed=1, outfit=PHONE)
-    renamed = replace(model, track_id=tuple(f"new {track}" for track in model.track_id))
-    moved = _truth_on(renamed, truth)
-    assert moved.track_id == ("new 77R-03",)
-    assert moved.simulated
-    np.testing.assert_allclose(moved.offset, truth.offset, atol=2e-3)
-    np.testing.assert_array_equal(moved.time, truth.time)
-    with pytest.raises(OffModelError):
-        _truth_on(renamed, replace(truth, latitude=truth.latitude + 0.01))
-
-
-def test_the_axis_of_a_model_beside_the_true_one(here: Path) -> None:
-    from railnav.cli.demo import _axis_error
-    from railnav.io.geojson import read_geojson
-
-    network = json.loads((here / "line.geojson").read_text(encoding="utf-8"))
-    network["features"] = [f for f in network["features"] if f["properties"]["track"] in ("77R-03", "77L-10")]
-    (here / "two.geojson").write_text(json.dumps(network))
-    found = _axis_error(read_geojson(here / "two.geojson"), demo_line(spacing=5.0))
-    assert found["axis_rms_m"] == pytest.approx(0.0, abs=1e-3)
-    assert found["axis_tunnel_max_m"] == pytest.approx(0.0, abs=1e-3)
-    for feature in network["features"]:
-        for vertex in feature["geometry"]["coordinates"]:
-            vertex[1] += 0.5 / 111_250.0
-    (here / "two.geojson").write_text(json.dumps(network))
-    found = _axis_error(read_geojson(here / "two.geojson"), demo_line(spacing=5.0))
-    assert found["axis_rms_m"] is not None
-    assert 0.3 < found["axis_rms_m"] < 0.5, "half a metre north, seen across a line that runs north-east"
 
 
 def test_a_demo_that_fails_leaves_the_older_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
