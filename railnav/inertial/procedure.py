@@ -337,7 +337,7 @@ def _faces(
 ) -> tuple[FloatArray, FloatArray, list[int]]:
     """Readings of each axis with that axis up and down (or turned both ways), and how many there were of each."""
     sums, counts = np.zeros((3, 2)), np.zeros((3, 2), dtype=int)
-    bias = np.median(means, axis=0) if what == "turning" else np.zeros(3)  # that of gyros may be half the rate
+    bias = np.median(means, axis=0)  # that of raw gyros may be half the rate, of raw accelerometers a sixth of gravity
     for one, mean in zip(found, means, strict=True):
         sensed = mean - bias
         axis = int(np.argmax(np.abs(sensed)))
