@@ -320,7 +320,7 @@ def lay(kind, length, k0, k1, sway, east, north, bearing, owner, s, here, slopes
                 done = True
             width = target - at
             pieces = int(math.ceil(abs(width) / longest - 1e-9))
-            if pieces < 1:
+            if pieces < 1 or pieces > 1_000_000:
                 pieces = 1
             h = width / pieces
             for q in range(pieces):

@@ -26,10 +26,14 @@ IntArray = NDArray[np.int64]
 FLOOR = 5e-4
 FLOOR_CANT = 2e-4
 #: A law must be likelier than the clothoid by this, in -2 log likelihood, to be said; and one transition's than the track's.
-LAW_WORTH = 10.0
+LAW_WORTH = 6.0
 LAW_ALONE = 25.0
 #: A sum of squares may grow by this for each element that is left out.
 _DEARER = 9.0
+#: Points this far on both sides tell whether an edit is worth it, m.
+_AROUND = 20.0
+#: Cubic parabolas turn by less, rad.
+_CUBIC_TURN = 0.5
 _LAWS = (elements.BLOSS, elements.COSINE, elements.SINE, elements.HELMERT, elements.CUBIC)
 #: Height of the centre of gravity that a Viennese bend is made for, m.
 SWAY_HEIGHT = 1.8
@@ -158,6 +162,8 @@ def fit_design(
     per_point = np.sqrt(white**2 + noise.correlated**2) if noise.correlated > 0.0 else white
     fit = fit_plan(chain_of_pieces(pieces, along, ref), along, east, north, per_point)
     fit = _simplified(fit, east, north, per_point, noise)
+    items = judgement.items_of(fit.chain)
+    fit = _tried(fit, judgement.smooth_joints(items), east, north, per_point, _spread(fit, noise))
     tell(label, 2, total)
     fit, margin, second = _with_laws(fit, east, north, per_point, noise, laws)
     tell(label, 3, total)
@@ -249,6 +255,7 @@ def _simplified(fit: PlanFit, east: FloatArray, north: FloatArray, sigma: FloatA
         fewer = judgement.simplify(items, bend_sigma, length_sigma)
         if len(fewer) == len(items) and all(a.kind == b.kind for a, b in zip(fewer, items, strict=True)):
             break
+        fewer = judgement.split_inflections(fewer)
         again = fit_plan(judgement.chain_of(fewer), fit.along, east, north, sigma)
         left_out = len(items) - len(fewer) + sum(a.kind == elements.ARC for a in items)
         left_out -= sum(a.kind == elements.ARC for a in fewer)
@@ -256,6 +263,31 @@ def _simplified(fit: PlanFit, east: FloatArray, north: FloatArray, sigma: FloatA
             break
         fit = again
     return fit
+
+
+def _tried(
+    fit: PlanFit,
+    edits: list[judgement.Edit],
+    east: FloatArray,
+    north: FloatArray,
+    sigma: FloatArray,
+    spread: float,
+) -> PlanFit:
+    """The fit with those edits that cost less than they save."""
+    if not edits:
+        return fit
+    items = judgement.items_of(fit.chain)
+    edges = fit.chain.edges
+    low = np.array([edges[edit.first] for edit in edits]) - _AROUND
+    high = np.array([edges[edit.last] for edit in edits]) + _AROUND
+    trial = fit_plan(judgement.chain_of(judgement.applied(items, edits)), fit.along, east, north, sigma)
+    dearer = (judgement.squares_between(trial, low, high) - judgement.squares_between(fit, low, high)) / spread
+    good = [e for e, cost in zip(edits, dearer.tolist(), strict=True) if cost < _DEARER * e.fewer]
+    if len(good) == len(edits):
+        return trial
+    if not good:
+        return fit
+    return fit_plan(judgement.chain_of(judgement.applied(items, good)), fit.along, east, north, sigma)
 
 
 def _with_laws(
@@ -267,42 +299,70 @@ def _with_laws(
     laws: tuple[int, ...],
 ) -> tuple[PlanFit, float, str]:
     """The fit with the law of transitions that the points prefer, its margin over the next, and which that is."""
-    chain = fit.chain
-    turning = chain.kind >= CLOTHOID
-    if not turning.any():
+    if not (fit.chain.kind >= CLOTHOID).any():
         return fit, float("nan"), ""
     spread = _spread(fit, noise)
-    fits: dict[int, PlanFit] = {CLOTHOID: fit}
-    for law in laws:
-        trial = judgement.with_law(chain, law)
-        if (
-            law == elements.CUBIC
-            and (np.maximum(np.abs(trial.k0), np.abs(trial.k1)) * trial.length)[turning].max() > 0.5
-        ):
+    items = judgement.items_of(fit.chain)
+    edits = judgement.joined_runs(items)
+    joined = judgement.chain_of(judgement.applied(items, edits))
+    fits: dict[int, PlanFit] = {}
+    for law in (CLOTHOID, *laws):
+        trial = judgement.with_law(joined, law)
+        turning = trial.kind >= CLOTHOID
+        sharp = (np.maximum(np.abs(trial.k0), np.abs(trial.k1)) * trial.length)[turning]
+        if law == elements.CUBIC and sharp.max() > _CUBIC_TURN:
             continue
-        fits[law] = fit_plan(trial, fit.along, east, north, sigma, steps=12)
-    cost = {law: found.cost / spread for law, found in fits.items()}
+        if law == CLOTHOID and not edits:
+            fits[law] = fit
+        else:
+            fits[law] = fit_plan(trial, fit.along, east, north, sigma, steps=15)
+    edges = fit.chain.edges
+    # stretches of transitions in the fit as found, runs as one
+    first = {e.first: e for e in edits}
+    spans: list[tuple[int, int, int]] = []
+    j = 0
+    while j < len(items):
+        if j in first:
+            spans.append((j, first[j].last, first[j].fewer))
+            j = first[j].last
+        else:
+            if items[j].kind >= CLOTHOID:
+                spans.append((j, j + 1, 0))
+            j += 1
+    low = np.array([edges[a] - max(0.5 * (edges[b] - edges[a]), _AROUND) for a, b, _ in spans])
+    high = np.array([edges[b] + max(0.5 * (edges[b] - edges[a]), _AROUND) for a, b, _ in spans])
+    several = np.array([few for _, _, few in spans])
+    apart = judgement.squares_between(fit, low, high) / spread + _DEARER * several
+    local = {law: judgement.squares_between(found, low, high) / spread for law, found in fits.items()}
+    # where several clothoids are needed whatever the law, they tell nothing of it
+    cost = {law: float(np.minimum(values, apart).sum()) for law, values in local.items()}
     order = sorted(cost, key=lambda law: cost[law])
     best = order[0] if cost[order[0]] < cost[CLOTHOID] - LAW_WORTH else CLOTHOID
     second = next((law for law in order if law != best), best)
     margin = cost[second] - cost[best] if second != best else float("nan")
-    # one transition may follow a law of its own, where the points insist
-    mine = judgement.evidence_by_transition(fits[best]) / spread
-    law_of = np.full(len(chain.kind), best)
-    least = mine.copy()
-    for law, found in fits.items():
-        if law in (best, elements.CUBIC):
-            continue
-        other = judgement.evidence_by_transition(found) / spread
-        better = turning & (other < mine - LAW_ALONE) & (other < least)
-        law_of[better], least[better] = law, other[better]
-    chosen = fits[best]
-    if (law_of[turning] != best).any():
-        mixed = fit_plan(judgement.with_law(chosen.chain, law_of), chosen.along, east, north, sigma)
-        if mixed.cost / spread < chosen.cost / spread - LAW_WORTH:
-            chosen = mixed
-    elif best != CLOTHOID and not chosen.settled:
-        chosen = fit_plan(chosen.chain, chosen.along, east, north, sigma)
+    law_of = np.full(len(spans), best)
+    least = local[best] - LAW_ALONE
+    for law, values in local.items():
+        if law not in (best, elements.CUBIC):
+            better = values < least
+            law_of[better], least[better] = law, values[better]
+    chosen_cost = np.choose(np.searchsorted(sorted(local), law_of), [local[law] for law in sorted(local)])
+    stay = (several > 0) & (apart < chosen_cost)
+    kept = [e for e, whole in zip(edits, stay[several > 0].tolist(), strict=True) if not whole]
+    merged = judgement.applied(items, kept)
+    # laws by element of the merged chain
+    per_item: list[int] = []
+    for (a, b, few), law, whole in zip(spans, law_of.tolist(), stay.tolist(), strict=True):
+        per_item += [CLOTHOID] * (b - a) if few and whole else [law]
+    law_by_item = np.full(len(merged), CLOTHOID)
+    law_by_item[[i for i, item in enumerate(merged) if item.kind >= CLOTHOID]] = per_item
+    if not edits and (law_of == best).all():
+        chosen = fits[best]
+        if not chosen.settled:
+            chosen = fit_plan(chosen.chain, chosen.along, east, north, sigma)
+    else:
+        start = fits[best].chain if not stay.any() and (law_of == best).all() else judgement.chain_of(merged)
+        chosen = fit_plan(judgement.with_law(start, law_by_item), fit.along, east, north, sigma)
     return chosen, float(margin), elements.KIND_NAMES[second]
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from railnav.monitoring.fitting.plan import Chain, PlanFit
+from railnav.monitoring.fitting.plan import ROBUST, Chain, PlanFit
 from railnav.track import elements
 
 FloatArray = NDArray[np.float64]
@@ -171,6 +171,18 @@ def simplify(items: list[Item], bend_sigma: FloatArray, length_sigma: FloatArray
                     del work[j], sigma[j]
                     changed = True
                     break
+            if item.kind >= elements.CLOTHOID and item.length < 0.5:
+                if before is not None and before.kind >= elements.CLOTHOID and item.smooth:
+                    work[j - 1] = replace(before, length=before.length + item.length, k1=item.k1)
+                    del work[j], sigma[j]
+                    changed = True
+                    break
+                if after is not None and after.kind >= elements.CLOTHOID and after.smooth:
+                    grown = replace(item, length=after.length + item.length, k1=after.k1)
+                    work[j : j + 2] = [grown]
+                    del sigma[j]
+                    changed = True
+                    break
             short = item.length < _NO_LENGTH * sigma[j][1]
             if item.kind < elements.CLOTHOID and short and before is not None and after is not None:
                 turning = before.kind >= elements.CLOTHOID and after.kind >= elements.CLOTHOID
@@ -205,10 +217,73 @@ def with_law(chain: Chain, law: int | IntArray) -> Chain:
     return replace(chain, kind=np.where(between, elements.CLOTHOID, kind).astype(np.int64))
 
 
-def evidence_by_transition(fit: PlanFit, reach: float = 0.5) -> FloatArray:
-    """Weighted squares of the points on each element and `reach` of its length on both sides, (m,)."""
-    square = np.append(0.0, np.cumsum(fit.weight * (fit.residual / fit.sigma) ** 2))
-    edges = fit.chain.edges
-    low = np.searchsorted(fit.along, edges[:-1] - reach * fit.chain.length)
-    high = np.searchsorted(fit.along, edges[1:] + reach * fit.chain.length)
-    return np.asarray(square[high] - square[low])
+@dataclass(frozen=True, slots=True)
+class Edit:
+    """A change to try: the elements from `first` to before `last` become `items`, with `fewer` unknowns."""
+
+    first: int
+    last: int
+    items: tuple[Item, ...]
+    fewer: int
+
+
+def smooth_joints(items: list[Item]) -> list[Edit]:
+    """Edits that let curvature pass on where a transition's end jumps."""
+    edits: list[Edit] = []
+    for j in range(1, len(items)):
+        before, item = items[j - 1], items[j]
+        if item.smooth or max(before.kind, item.kind) < elements.CLOTHOID:
+            continue
+        if before.kind >= elements.CLOTHOID and item.kind >= elements.CLOTHOID:
+            mean = 0.5 * (before.k1 + item.k0)
+            pair = (replace(before, k1=mean), replace(item, k0=mean, smooth=True))
+        elif before.kind >= elements.CLOTHOID:
+            pair = (replace(before, k1=item.k0), replace(item, smooth=True))
+        else:
+            pair = (before, replace(item, k0=before.k1, smooth=True))
+        if edits and edits[-1].last > j - 1:
+            continue  # one at a time where they touch
+        edits.append(Edit(j - 1, j + 1, pair, 1))
+    return edits
+
+
+def joined_runs(items: list[Item]) -> list[Edit]:
+    """Edits that make one transition of several that follow each other and bend further all the time."""
+    edits = []
+    j = 0
+    while j < len(items):
+        if items[j].kind < elements.CLOTHOID:
+            j += 1
+            continue
+        end = j + 1
+        while end < len(items) and items[end].kind >= elements.CLOTHOID and items[end].smooth:
+            if items[end].k0 == 0.0:  # a point of inflection parts them
+                break
+            rates = [item.k1 - item.k0 for item in items[j : end + 1]]
+            if min(rates) < 0.0 < max(rates):
+                break
+            end += 1
+        if end - j > 1:
+            run = items[j:end]
+            one = replace(run[0], length=sum(item.length for item in run), k1=run[-1].k1)
+            edits.append(Edit(j, end, (one,), 2 * (end - j - 1)))
+        j = end
+    return edits
+
+
+def applied(items: list[Item], edits: list[Edit]) -> list[Item]:
+    """The elements after edits that do not overlap."""
+    out: list[Item] = []
+    at = 0
+    for edit in edits:
+        out += items[at : edit.first]
+        out += edit.items
+        at = edit.last
+    return out + items[at:]
+
+
+def squares_between(fit: PlanFit, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Weighted squares of the points between places along the axis, (k,)."""
+    ratio = np.abs(fit.residual) / fit.sigma
+    square = np.append(0.0, np.cumsum(np.where(ratio > ROBUST, ROBUST * (2.0 * ratio - ROBUST), ratio**2)))
+    return np.asarray(square[np.searchsorted(fit.along, high)] - square[np.searchsorted(fit.along, low)])

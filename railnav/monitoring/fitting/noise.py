@@ -23,10 +23,10 @@ _FOURTH = 70.0
 #: Differences of smooth points grow sixteenfold as the spacing doubles, those of white noise not; points are thinned above this.
 _STILL_SMOOTH = 2.5
 #: Samples on which the waves of the noise are judged.
-_JUDGED = 1600
-#: Lengths of waves tried, in spacings, and their sizes, in white sigmas.
-_LENGTHS = (3.0, 8.0, 20.0, 60.0)
-_SIZES = (0.5, 1.0, 2.0, 4.0, 8.0)
+_JUDGED = 1200
+#: Steps of the search for waves, in logarithms, and how many noises are tried.
+_STRIDES = (1.1, 0.5)
+_TRIALS = 32
 #: Waves must be likelier than none by this, in -2 log likelihood.
 _WORTH = 12.0
 
@@ -124,23 +124,42 @@ def likeliest(
         white = float(np.mean(noise.sigma))
         return sum(pieces(noise, p).cost + (p.stop - p.start) * 2.0 * float(np.log(white)) for p in stretches)
 
-    best = Noise(sigma if stated is None else stated)
-    plain = least = cost(best)
-    whites = (1.0,) if stated is not None else (1.0, 0.7)
-    for length in _LENGTHS:
-        for size in _SIZES:
-            improved = False
-            for share in whites:
-                trial = Noise(max(share * sigma, floor) if stated is None else stated, size * sigma, length * spacing)
-                value = cost(trial)
-                if value < least - 1.0 and value < plain - _WORTH:
-                    best, least, improved = trial, value, True
-            if not improved and size >= 2.0:
-                break
+    def noise_of(place: tuple[float, float, float]) -> Noise:
+        """From logarithms: white noise, growth of the waves over one spacing, their length."""
+        white, growth, length = np.exp(place)
+        size = growth * np.sqrt(0.5 * length / spacing)
+        return Noise(max(float(white), floor) if stated is None else stated, float(size), float(length))
+
+    plain = Noise(sigma if stated is None else stated)
+    least_plain = cost(plain)
     if stated is None:
-        for share in (0.7, 0.85, 1.2, 1.5, 2.0):
-            trial = Noise(max(share * float(np.mean(best.sigma)), floor), best.correlated, best.length)
+        for share in (0.8, 1.25):
+            trial = Noise(max(share * sigma, floor))
             value = cost(trial)
-            if value < least - 1.0:
-                best, least = trial, value
-    return best
+            if value < least_plain:
+                plain, least_plain = trial, value
+    if sigma <= 1.01 * floor and stated is None:
+        return plain  # exact points have no waves
+    white = 0.3 * sigma if stated is None else stated
+    place = (float(np.log(white)), float(np.log(1.2 * sigma)), float(np.log(8.0 * spacing)))
+    known = {place: cost(noise_of(place))}
+    low = (np.log(floor), np.log(1e-3 * sigma), np.log(2.0 * spacing))
+    high = (np.log(4.0 * sigma), np.log(8.0 * sigma), np.log(max(0.2 * count * spacing, 4.0 * spacing)))
+    for stride in _STRIDES:
+        moved = True
+        while moved and len(known) < _TRIALS:
+            moved = False
+            for axis in range(3) if stated is None else (1, 2):
+                for sense in (1.0, -1.0):
+                    trial_place = list(place)
+                    trial_place[axis] = float(np.clip(place[axis] + sense * stride, low[axis], high[axis]))
+                    there = (trial_place[0], trial_place[1], trial_place[2])
+                    if there in known:
+                        continue
+                    known[there] = cost(noise_of(there))
+                    if known[there] < known[place] - 0.5:
+                        place, moved = there, True
+                        break
+    if known[place] < least_plain - _WORTH:
+        return noise_of(place)
+    return plain

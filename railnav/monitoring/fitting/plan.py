@@ -28,6 +28,10 @@ _OWN = 4
 _MOST_STEPS = 40
 #: Lengths settle within this, m.
 _SETTLED = 2e-4
+#: How far elements may miss each other on the way, m, rad.
+_APART, _TURNED = 0.02, 1e-3
+#: No track bends more than this, 1/m.
+_SHARPEST = 0.2
 #: A length changes by no more than this share in a step.
 _STRIDE = 0.5
 
@@ -197,25 +201,47 @@ def fit_plan(
     start[:, :2] -= origin
     chain = replace(chain, start=start)
     m = len(chain.kind)
+    settled = False
+    reach = 2.0 * float(along[-1] - along[0]) + 100.0
     edges = chain.edges
     owner = np.clip(np.searchsorted(edges, along, side="right") - 1, 0, m - 1).astype(np.int64)
     s = along - edges[owner]
     robust = np.ones(len(x))
-    settled, cost = False, np.inf
     state = _lay(chain, owner, s)
-    for count in range(steps):
-        for _ in range(3 if count == 0 else 1):
-            owner, s = _feet(chain, owner, s, x, y, state)
-            state = _lay(chain, owner, s)
-        residual, rows, kkt, rhs = _equations(chain, owner, s, x, y, sigma, robust, state)
-        solution = _solve(kkt, rhs)
-        step = solution[: _OWN * m + len(chain.bend)]
-        chain, moved = _stepped(chain, step, s[-1] if owner[-1] == m - 1 else None)
+    for _ in range(3):
+        owner, s = _feet(chain, owner, s, x, y, state)
         state = _lay(chain, owner, s)
+    damping, merit = 1e-5, _merit(chain, x, y, sigma, state)
+    for count in range(steps):
+        residual, rows, kkt, rhs = _equations(chain, owner, s, x, y, sigma, robust, state, damping)
+        step = _solve(kkt, rhs)[: _OWN * m + len(chain.bend)]
+        end = s[-1] if owner[-1] == m - 1 else None
+        for _ in range(7):  # a step that leads away is taken again, shorter
+            trial, moved = _stepped(chain, step, end)
+            if not _lawful(trial, reach):
+                damping = max(damping * 10.0, 1e-4)
+                _, rows, kkt, rhs = _equations(chain, owner, s, x, y, sigma, robust, state, damping)
+                step = _solve(kkt, rhs)[: _OWN * m + len(chain.bend)]
+                trial, moved = chain, 0.0
+                trial_owner, trial_s, trial_state, trial_merit = owner, s, state, merit
+                continue
+            trial_owner, trial_s = _refooted(chain, trial, owner, s)
+            trial_state = _lay(trial, trial_owner, trial_s)
+            trial_owner, trial_s = _feet(trial, trial_owner, trial_s, x, y, trial_state)
+            trial_state = _lay(trial, trial_owner, trial_s)
+            trial_merit = _merit(trial, x, y, sigma, trial_state)
+            if trial_merit <= merit * (1.0 + 1e-9) + 1e-6 or count == 0:
+                damping = max(damping * 0.2, 1e-9)
+                break
+            damping = max(damping * 10.0, 1e-4)
+            _, rows, kkt, rhs = _equations(chain, owner, s, x, y, sigma, robust, state, damping)
+            step = _solve(kkt, rhs)[: _OWN * m + len(chain.bend)]
+        gained = merit - trial_merit
+        chain, owner, s, state, merit = trial, trial_owner, trial_s, trial_state, trial_merit
+        residual = _across(x, y, state)
         ratio = np.abs(residual) / sigma
         robust = np.where(ratio > ROBUST, ROBUST / np.maximum(ratio, ROBUST), 1.0)
-        cost = float(np.sum(robust * (residual / sigma) ** 2))
-        if moved < _SETTLED and count > 2:
+        if count > 1 and (moved < _SETTLED or abs(gained) < 1e-5 * max(merit, 1.0)):
             settled = True
             break
     for _ in range(3):
@@ -288,6 +314,7 @@ def _equations(
     sigma: FloatArray,
     robust: FloatArray,
     state: tuple[FloatArray, ...],
+    damping: float = 0.0,
 ) -> tuple[FloatArray, object, object, FloatArray]:
     """Residuals, whitened design, and the normal equations with their conditions, eq (10)."""
     from scipy import sparse
@@ -361,10 +388,40 @@ def _equations(
         (np.concatenate(data), (np.concatenate(rows), np.concatenate(cols))), shape=(3 * (m - 1) + 2, p)
     )
     normal = design.T @ design
-    scale = _damping(chain, normal.diagonal())
+    scale = _damping(chain, normal.diagonal()) + damping * normal.diagonal()
     kkt = sparse.block_array([[normal + sparse.diags_array(scale), conditions.T], [conditions, None]], format="csc")
     rhs = np.concatenate([-(design.T @ (weight * residual)), rest])
     return residual, design, kkt, rhs
+
+
+def _lawful(chain: Chain, reach: float) -> bool:
+    """Whether a step has led to elements that there can be."""
+    finite = np.isfinite(chain.start).all() and np.isfinite(chain.length).all() and np.isfinite(chain.bend).all()
+    return bool(finite and chain.length.sum() < reach and np.abs(chain.bend).max(initial=0.0) < _SHARPEST)
+
+
+def _across(x: FloatArray, y: FloatArray, state: tuple[FloatArray, ...]) -> FloatArray:
+    """Distances of points from the axis at their feet, positive to the right."""
+    here = state[0]
+    return np.asarray((x - here[:, 0]) * np.cos(here[:, 2]) - (y - here[:, 1]) * np.sin(here[:, 2]))
+
+
+def _merit(chain: Chain, x: FloatArray, y: FloatArray, sigma: FloatArray, state: tuple[FloatArray, ...]) -> float:
+    """What a step must not raise: Huber's sum over the points, and how far elements miss each other."""
+    ratio = np.abs(_across(x, y, state)) / sigma
+    points = np.where(ratio > ROBUST, ROBUST * (2.0 * ratio - ROBUST), ratio**2).sum()
+    ends = state[2]
+    miss = chain.start[1:] - ends[:-1, :3]
+    apart = (miss[:, 0] ** 2 + miss[:, 1] ** 2).sum() / _APART**2 + (miss[:, 2] ** 2).sum() / _TURNED**2
+    return float(points + apart)
+
+
+def _refooted(chain: Chain, trial: Chain, owner: IntArray, s: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Feet kept where they were along the axis when lengths change."""
+    edges = trial.edges
+    total = chain.edges[owner] + s
+    found = np.clip(np.searchsorted(edges, total, side="right") - 1, 0, len(edges) - 2).astype(np.int64)
+    return found, total - edges[found]
 
 
 def _damping(chain: Chain, diagonal: FloatArray) -> FloatArray:
