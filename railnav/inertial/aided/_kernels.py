@@ -400,6 +400,7 @@ def aided_kernel(
     out,
     parameter,
     sigma,
+    slant,
     nis,
     used,
     node,
@@ -411,7 +412,8 @@ def aided_kernel(
     node_x,
 ):
     # (n, 3) rad, (n, 3) m/s, (n,) s, (11,), (10,), (N, N), (N - 9,) 1/s, (q,) columns, (q,) densities, (8,);
-    # measurements (m,) kind, sample after which, age s, (m, 8), (m, 8); out (n + 1, 10), (n + 1, N - 9), (n + 1, N), (m, 6), (m, 6);
+    # measurements (m,) kind, sample after which, age s, (m, 8), (m, 8); out (n + 1, 10), (n + 1, N - 9), (n + 1, N), covariance of
+    # latitude and longitude (n + 1,), (m, 6), (m, 6);
     # nodes: (K,) samples to keep or (0,), (K + 1, ...) each: state, parameters, U filtered, Phi^T and root of Q since the last, correction
     """Strapdown with a square-root error filter of any measurements; n, or the sample near a pole where it stopped."""
     N = U.shape[0]
@@ -544,6 +546,10 @@ def aided_kernel(
                 f[i] += B[j, i] * B[j, i]
         for i in range(N):
             sigma[k + 1, i] = math.sqrt(f[i])
+        both = 0.0
+        for j in range(N - 1):
+            both += B[j, N - 3] * B[j, N - 2]
+        slant[k + 1] = both
     U[:] = B[:N]
     return interval.shape[0]
 

@@ -122,6 +122,8 @@ class AidedSolution:
         States before the first and after every sample, (n + 1,).
     sigma : (n + 1, 9) array
         Position north, east, up, m; velocity north, east, down, m/s; attitude about north, east, down, rad.
+    covariance_north_east : (n + 1,) array
+        Of the position, m^2.
     parameters, parameter_sigma : mapping of name to (n + 1, k) array
         "gyro_bias", "accelerometer_bias" and the `Unknowns` that were estimated, as corrections to the nominal values; "clock" holds drift
         and bias. SI and radians.
@@ -140,6 +142,7 @@ class AidedSolution:
 
     trajectory: Trajectory
     sigma: FloatArray
+    covariance_north_east: FloatArray
     parameters: Mapping[str, FloatArray]
     parameter_sigma: Mapping[str, FloatArray]
     nis: Mapping[str, FloatArray]
@@ -266,6 +269,7 @@ def integrate(
     out, value, sigma = np.empty((n + 1, 10)), np.zeros((n + 1, nine)), np.empty((n + 1, N))
     out[0] = [start.latitude, start.longitude, start.height, *start.velocity_n, *start.quaternion_nb]
     sigma[0] = sigma0
+    slant = np.zeros(n + 1)
     nis, used = np.full((m, 6), np.nan), np.zeros((m, 6), dtype=np.bool_)
     node = _nodes(t, table.row, start_time) if smooth else np.empty(0, np.int64)
     K = len(node) + 1 if smooth else 0
@@ -297,6 +301,7 @@ def integrate(
         out,
         value,
         sigma,
+        slant,
         nis,
         used,
         node,
@@ -321,12 +326,14 @@ def integrate(
         at_nodes = np.sqrt(np.einsum("kij,kij->ki", roots, roots))
         stamps = np.concatenate([[start_time], t])
         sigma = np.stack([np.interp(stamps, node_time, column) for column in at_nodes.T], axis=1)
+        slant = np.interp(stamps, node_time, np.einsum("kj,kj->k", roots[:, N - 3], roots[:, N - 2]))
     sigma[:, nine + 6 :] *= scale
     place = [(name, int(at[g]), size) for g, (name, size) in enumerate(_GROUPS) if at[g] >= 0]
     by_kind = {name: table.kind == code for code, name in enumerate(_KINDS) if np.any(table.kind == code)}
     return AidedSolution(
         Trajectory(np.concatenate([[start_time], t]), out[:, 0], out[:, 1], out[:, 2], out[:, 3:6], out[:, 6:]),
         np.hstack([sigma[:, nine + 6 :], sigma[:, nine + 3 : nine + 6], sigma[:, nine : nine + 3]]),
+        slant * scale[0] * scale[1],
         {name: value[:, c : c + size] for name, c, size in place},
         {name: sigma[:, c : c + size] for name, c, size in place},
         {name: nis[rows] for name, rows in by_kind.items()},
