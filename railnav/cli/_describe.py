@@ -274,8 +274,31 @@ def print_solution(facts: dict[str, Any], title: str) -> None:
             "top speed": words.speed(facts["top_speed_m_s"]),
             "sigma along": _spread(facts["sigma_along_m"]),
             "protection level": f"{_spread(facts['protection_level_along_m'])} (risk {facts['integrity_risk']:g})",
+            **_findings(facts["diagnostics"]),
         },
     )
+
+
+def _findings(told: dict[str, Any]) -> dict[str, str]:
+    """What the navigator found out about the sensors, in words; nothing where a file does not tell."""
+    found: dict[str, str] = {}
+    if "gnss_sigma_scale" in told:
+        found["GNSS errors"] = f"{told['gnss_sigma_scale']:.2f} times the stated sigma"
+    offset = told.get("frame_offset_m")
+    if offset:
+        sigma = told.get("frame_offset_sigma_m", 0.0)
+        found["frame offset"] = f"{offset[0]:+.1f} m east, {offset[1]:+.1f} m north (prior sigma {sigma:.1f} m)"
+    names = {
+        "fixes_suspect": "suspect fixes",
+        "gnss_steps": "GNSS steps",
+        "wheel_slips": "wheel slips",
+        "balises_strange": "strange balises",
+        "track_revisions": "revised tracks",
+    }
+    events = [f"{told[key]:,} {name}" for key, name in names.items() if told.get(key)]
+    if events:
+        found["events"] = ", ".join(events)
+    return found
 
 
 def _spread(values: dict[str, float | None]) -> str:

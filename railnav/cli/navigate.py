@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from railnav.cli._verb import PATH, json_option
+from railnav.errors import InputError
+
+if TYPE_CHECKING:
+    from railnav.navigation.explanation import Decision
 
 
 @click.command("navigate")
@@ -22,14 +27,26 @@ from railnav.cli._verb import PATH, json_option
     help="Risk, per epoch, that the error exceeds the protection level.",
 )
 @click.option("--calibration", type=PATH, help="Calibration file of the IMU, .toml, where run.toml names none.")
+@click.option("--explain", type=PATH, help="Write why tracks were chosen, .jsonl or .csv: candidates and evidence.")
+@click.option("--alternatives", is_flag=True, help="Write all candidates beside a .csv, .parquet or .geojson solution.")
 @json_option
 def command(
-    run: Path, model: Path, output: Path, smooth: bool, integrity_risk: float, calibration: Path | None, as_json: bool
+    run: Path,
+    model: Path,
+    output: Path,
+    smooth: bool,
+    integrity_risk: float,
+    calibration: Path | None,
+    explain: Path | None,
+    alternatives: bool,
+    as_json: bool,
 ) -> None:
     """Place a run on a model: track, offset, speed, and how sure that is.
 
     RUN is a folder with a run.toml. The solution has one row an epoch, with standard deviations, the protection level
     along the track, the probability of the track and the navigator's mode. Files .gpkg and .geojson open in QGIS.
+    A .gpkg also holds a table "alternatives": all tracks the train can be on at epochs that are not certain; beside
+    other files --alternatives writes it as NAME_alternatives.csv (or .parquet).
 
     \b
     Example:
@@ -42,16 +59,36 @@ def command(
     _files.check_output(
         output, _files.SOLUTION_ENDINGS, inputs=[model, *_files.members(run), *([calibration] if calibration else [])]
     )
+    if explain is not None:
+        _files.check_output(explain, (".jsonl", ".csv"), inputs=[model, output, *_files.members(run)])
+    beside = None
+    if alternatives and output.suffix.lower() != ".gpkg":
+        ending = ".parquet" if output.suffix.lower() == ".parquet" else ".csv"
+        beside = _files.check_output(output.with_name(f"{output.stem}_alternatives{ending}"), (ending,))
+    if alternatives and smooth:
+        raise InputError("--alternatives with --smooth", remedy="the smoother keeps one path: leave out one of both")
     from railnav.io.imu_calibration import calibrated_run
     from railnav.io.run import read_run
     from railnav.navigation import navigate
 
     recorded, reference = calibrated_run(read_run(run), calibration), _files.read_model(model)
+    decisions: list[Decision] | None = None if explain is None else []
     with progress() as report:
-        solution = navigate(recorded, reference, smooth=smooth, integrity_risk=integrity_risk, progress=report)
+        solution = navigate(
+            recorded, reference, smooth=smooth, integrity_risk=integrity_risk, explain=decisions, progress=report
+        )
     solution.to_file(output)
+    if beside is not None:
+        from railnav.io.solution import write_alternatives
+
+        write_alternatives(solution, beside)
+    if explain is not None and decisions is not None:
+        from railnav.io.explanation import write_decisions
+
+        write_decisions(decisions, explain)
     facts = describe_solution(solution)
     if as_json:
-        print_json({**facts, "output": output})
+        more = {"explain": explain} if explain is not None else {}
+        print_json({**facts, "output": output, **more, **({"alternatives": beside} if beside is not None else {})})
     else:
-        print_solution(facts, f"{output} written")
+        print_solution(facts, " and ".join(str(p) for p in (output, beside, explain) if p is not None) + " written")

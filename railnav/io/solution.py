@@ -20,7 +20,7 @@ from railnav.io.atomic import atomic_path
 from railnav.io.container import bounds_of, create, opened, point_blobs
 from railnav.io.qgis_styles import add_styles
 from railnav.io.tables import PARQUET_ENDINGS, Column, Table, Words, check_table, freeze, read_table, write_table
-from railnav.navigation.solution import Mode, Solution
+from railnav.navigation.solution import Alternatives, Mode, Solution
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -31,6 +31,8 @@ CONTENT = "solution"
 SCHEMA_VERSION = 1
 #: Layer of a GeoPackage.
 LAYER = "solution"
+#: Its table of candidates.
+ALTERNATIVES = "alternatives"
 #: Grid heights that differ from ellipsoidal ones by more than this, m, get a column of their own.
 _SAME_HEIGHT = 1e-4
 
@@ -61,6 +63,14 @@ _COLUMNS = (
 )
 #: Stands in a file only where the plane's heights are not ellipsoidal heights of WGS 84.
 _GRID_HEIGHT = Column("grid_height_m", required=False, complete=False)
+
+_ALTERNATIVES = (
+    Column("time_s"),
+    Column("track", text=True),
+    Column("offset_m"),
+    Column("probability"),
+    Column("running_direction"),
+)
 
 _DECIMALS: Mapping[str, int] = {
     "time_s": 6,
@@ -160,14 +170,15 @@ def read_solution(path: str | Path) -> Solution:
     path = Path(path)
     ending = path.suffix.lower()
     columns = (*_COLUMNS, _GRID_HEIGHT)
+    others: Table | None = None
     if ending == ".gpkg":
-        table = _read_geopackage(path)
+        table, others = _read_geopackage(path)
     elif ending in (".geojson", ".json"):
         table = _read_geojson(path)
     else:
         table = read_table(path, columns)
     check_table(table, columns)
-    return _solution(table)
+    return _solution(table, others)
 
 
 # --- columns ----------------------------------------------------------------------------------------------------------
@@ -221,10 +232,14 @@ def _metadata(solution: Solution, path: Path) -> dict[str, Any]:
     }
 
 
-def _solution(table: Table) -> Solution:
+def _solution(table: Table, others: Table | None = None) -> Solution:
     time = table.increasing("time_s")
     track, number, metadata = table.words["track"], table.number, table.metadata
     _check_rows(table)
+    track_id, lines, alternatives = track.word, _lines(table), Alternatives.none()
+    if others is not None:
+        check_table(others, _ALTERNATIVES)
+        track_id, lines, alternatives = _with_alternatives(track_id, lines, time, others)
     mode = table.words["mode"]
     known = np.array([_MODES.get(word, -1) for word in mode.word], dtype=np.int64)[mode.code]
     if (known < 0).any():
@@ -238,8 +253,8 @@ def _solution(table: Table) -> Solution:
     risk = metadata.get("integrity_risk")
     diagnostics = metadata.get("diagnostics")
     return Solution(
-        track_id=track.word,
-        line=_lines(table),
+        track_id=track_id,
+        line=lines,
         time=time,
         track=track.code,
         offset=number["offset_m"],
@@ -265,7 +280,73 @@ def _solution(table: Table) -> Solution:
         integrity_risk=risk if isinstance(risk, float) and 0 < risk < 1 else 1e-4,
         smoothed=metadata.get("smoothed") is True,
         diagnostics=diagnostics if isinstance(diagnostics, dict) else {},
+        alternatives=alternatives,
     )
+
+
+def _with_alternatives(
+    track_id: tuple[str, ...], lines: tuple[str, ...], time: FloatArray, others: Table
+) -> tuple[tuple[str, ...], tuple[str, ...], Alternatives]:
+    """Candidates of a file; tracks that no row stands on are added behind those of the rows, their line unknown."""
+    named = others.words["track"]
+    index = {name: i for i, name in enumerate(track_id)}
+    for name in named.word:
+        index.setdefault(name, len(index))
+    row = np.searchsorted(time, others.number["time_s"] - 1e-7)
+    if (
+        wrong := (row >= len(time)) | (np.abs(time[np.minimum(row, len(time) - 1)] - others.number["time_s"]) > 1e-6)
+    ).any():
+        others.refuse(int(np.argmax(wrong)), "time_s", "is no time of the solution", "write the file anew")
+    code = np.array([index[name] for name in named.word], np.int64)
+    alternatives = Alternatives(
+        freeze(row.astype(np.int64)),
+        freeze(code[named.code]),
+        others.number["offset_m"],
+        others.number["probability"],
+        freeze(others.number["running_direction"].astype(np.int64)),
+    )
+    return tuple(index), (*lines, *("" for _ in range(len(index) - len(track_id)))), alternatives
+
+
+def alternatives_columns(solution: Solution) -> dict[str, FloatArray | Words]:
+    """The candidates of a solution as columns of a table."""
+    told = solution.alternatives
+    return {
+        "time_s": solution.time[told.row],
+        "track": Words(told.track, solution.track_id),
+        "offset_m": told.offset,
+        "probability": told.probability,
+        "running_direction": told.running_direction.astype(np.float64),
+    }
+
+
+def write_alternatives(solution: Solution, path: str | Path) -> None:
+    """Write the candidates of a solution's uncertain rows as .csv or .parquet by the ending, whole or not at all.
+
+    Parameters
+    ----------
+    solution : Solution
+        One that was not smoothed.
+    path : path
+        File to write; replaced in one step if it exists. Columns: `time_s, track, offset_m, probability, running_direction`.
+
+    Raises
+    ------
+    InputError
+        The ending is neither, or the file cannot be written.
+
+    Examples
+    --------
+    >>> write_alternatives(read_solution("nowhere.csv"), "alternatives.csv")
+    Traceback (most recent call last):
+    railnav.errors.InputError: nowhere.csv: does not exist; check the name
+    """
+    path = Path(path)
+    if path.suffix.lower() not in {".csv", *PARQUET_ENDINGS}:
+        raise InputError("alternatives are written as .csv or .parquet", file=path)
+    decimals = {"time_s": 6, "offset_m": 4, "probability": 9, "running_direction": 0}
+    with atomic_path(path) as draft:
+        write_table(draft, alternatives_columns(solution), decimals=decimals, metadata={})
 
 
 def _check_rows(table: Table) -> None:
@@ -352,20 +433,33 @@ def _write_geopackage(
             bounds=bounds_of(at[0], at[1]),
             description=f"Train positions {solution.run_id}, time from {solution.start}".strip(),
         )
+        if len(solution.alternatives):
+            told = alternatives_columns(solution)
+            kinds = ", ".join(f"{name} {'TEXT' if isinstance(v, Words) else 'DOUBLE'}" for name, v in told.items())
+            container.add_table(
+                ALTERNATIVES,
+                kinds,
+                zip(range(1, len(solution.alternatives) + 1), *(_cells(v) for v in told.values()), strict=True),
+                description="Candidates of the epochs whose track is not certain, most probable first",
+            )
         add_styles(container, (LAYER,))
         container.add_meta(
             content=CONTENT, schema_version=SCHEMA_VERSION, created_by=f"railnav {__version__}", **metadata
         )
 
 
-def _read_geopackage(path: Path) -> Table:
+def _read_geopackage(path: Path) -> tuple[Table, Table | None]:
     with opened(path, CONTENT, newest=SCHEMA_VERSION, error=InputError) as reader:
         found = reader.columns(LAYER)
         wanted = [*_COLUMNS, *([_GRID_HEIGHT] if _GRID_HEIGHT.name in found else [])]
         rows = reader.select(LAYER, [column.name for column in wanted])
         if not rows:
             reader.refuse("has no rows", layer=LAYER)
-        return _typed(path, wanted, zip(*rows, strict=True), reader.meta)
+        table = _typed(path, wanted, zip(*rows, strict=True), reader.meta)
+        if ALTERNATIVES not in reader.tables():
+            return table, None
+        others = reader.select(ALTERNATIVES, [column.name for column in _ALTERNATIVES])
+        return table, _typed(path, list(_ALTERNATIVES), zip(*others, strict=True), {}) if others else None
 
 
 def _typed(path: Path, wanted: list[Column], cells: Any, metadata: dict[str, Any]) -> Table:

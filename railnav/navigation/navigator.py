@@ -14,6 +14,7 @@ from railnav.matching.network import balises_of
 from railnav.navigation import columns as c
 from railnav.navigation.engine import Engine
 from railnav.navigation.epochs import COLUMNS, IDLE_STEP, Epoch
+from railnav.navigation.explanation import Candidate, candidates_now
 from railnav.navigation.solution import Mode
 from railnav.navigation.state import Settings
 
@@ -178,6 +179,10 @@ class Navigator:
     def settings(self) -> Settings:
         """What is assumed of sensors and trains, with what the model itself says filled in."""
         return self._engine.settings
+
+    def candidates(self) -> tuple[Candidate, ...]:
+        """All ways in which the train can have gone, most probable first, and what each kind of evidence has said of them."""
+        return candidates_now(self._engine)
 
     def step(self, epoch: Epoch) -> Position:
         """Take in one epoch and say where the train is.

@@ -15,8 +15,9 @@ from railnav.matching.network import balises_of
 from railnav.navigation import columns as c
 from railnav.navigation.engine import SLOTS, Engine
 from railnav.navigation.epochs import raw_table
+from railnav.navigation.explanation import Decision, alternatives, decisions
 from railnav.navigation.smoothing import smooth_rows
-from railnav.navigation.solution import Mode, Solution
+from railnav.navigation.solution import Alternatives, Mode, Solution
 from railnav.navigation.state import Settings
 from railnav.run import Progress, Run
 
@@ -37,6 +38,7 @@ def navigate(
     smooth: bool = False,
     integrity_risk: float = 1e-4,
     settings: Settings | None = None,
+    explain: list[Decision] | None = None,
     progress: Progress | None = None,
 ) -> Solution:
     """Place a run on a model: which track, where on it, how fast, how sure.
@@ -58,6 +60,9 @@ def navigate(
         Risk, per row, that the along-track error exceeds the protection level.
     settings : Settings, optional
         What is assumed of sensors and trains; by default `Settings.of_receiver` for the receiver that the run names.
+    explain : list, optional
+        Receives a `Decision` for each epoch at which what is said of the track changes: the candidates, and what each kind of evidence
+        said of them. With `smooth` these are the decisions of the filter, before the smoother.
     progress : Progress, optional
         Called with a label, rows done and rows in all.
 
@@ -67,6 +72,7 @@ def navigate(
         One row an epoch. `track_probability` is the posterior of the row's track; below 0.99 the mode is ambiguous.
         `protection_level_along` bounds the error along the track over all hypotheses, also those on other tracks (their places are
         projected onto the row's track), so that it holds whichever track is right; that the track is right, it does not say.
+        `alternatives` holds all candidates of the rows whose track is not certain (none when smoothed).
         `sigma_cross` is the model's, or 0.5 m where the model states none (diagnostics: sigma_cross_assumed).
 
     Raises
@@ -104,6 +110,7 @@ def navigate(
         receiver=gnss.receiver,
         balises=run.balise is not None and len(balises) > 0,
         records=2 * m + 2 * SLOTS if smooth else 0,
+        journal=(0 if smooth else 2) + (0 if explain is None else 1),
     )
     table = engine.table(raw)
     out = np.empty((m, c.OUTPUT_SIZE))
@@ -115,6 +122,8 @@ def navigate(
             progress("navigate", stop, m)
     if engine.shared.common[c.C_STARTS] == 0.0:
         raise OffModelError(_distance_from(run, model, table, engine.settings.sigma_usable))
+    if explain is not None:
+        explain += decisions(engine, table[:, c.TIME], out)
     if smooth:
         out = smooth_rows(engine, table, out, progress=progress)
     return _solution(run, engine, table, out, smooth)
@@ -198,6 +207,7 @@ def _solution(run: Run, engine: Engine, table: FloatArray, out: FloatArray, smoo
         integrity_risk=float(engine.filter.risk[0]),
         smoothed=smooth,
         diagnostics=_diagnostics(engine, mode, assumed),
+        alternatives=Alternatives.none() if smooth else alternatives(engine),
     )
 
 
@@ -229,6 +239,8 @@ def _diagnostics(engine: Engine, mode: IntArray, assumed: bool) -> dict[str, Any
         "frame_offset_sigma_m": float(common[c.C_FRAME_SIGMA]),
         "frame_offset_m": [] if best is None else bank.x[best, :2].tolist(),
         "wheel_slips": int(common[c.C_SLIPS]),
+        "balises_read": int(common[c.C_BALISES]),
+        "balises_strange": int(common[c.C_STRANGE_BALISES]),
         "starts": int(common[c.C_STARTS]),
         "track_revisions": int(common[c.C_REVISIONS]),
         "sigma_cross_assumed": assumed,

@@ -31,6 +31,40 @@ class Mode(IntEnum):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Alternatives:
+    """Candidates of the rows whose track is not certain: (k,) arrays, by row, most probable first; the row's own track is among them.
+
+    Attributes
+    ----------
+    row : (k,) int array
+        Row of the solution.
+    track : (k,) int array
+        Index into the solution's `track_id`.
+    offset : (k,) array
+        m.
+    probability : (k,) array
+        Posterior; those of a row sum to at most 1 (what is missing lies on tracks below 1e-4, or outside the model).
+    running_direction : (k,) int array
+        +1 when the nose points to growing offset, -1 otherwise.
+    """
+
+    row: IntArray
+    track: IntArray
+    offset: FloatArray
+    probability: FloatArray
+    running_direction: IntArray
+
+    @classmethod
+    def none(cls) -> Alternatives:
+        """No candidates: every row is certain, or nothing was kept."""
+        whole, real = np.empty(0, np.int64), np.empty(0)
+        return cls(whole, whole, real, real, whole)
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Solution:
     """Frozen table of a navigated run; (m,) arrays, SI and radians, one row an epoch.
 
@@ -77,6 +111,8 @@ class Solution:
         Whether rows are fixed-interval smoothed rather than filtered.
     diagnostics : dict
         Counts and settings: epochs, fixes used and rejected, decisions; JSON values only.
+    alternatives : Alternatives
+        All candidates of the rows whose track is not certain.
     """
 
     track_id: tuple[str, ...]
@@ -106,6 +142,7 @@ class Solution:
     integrity_risk: float = 1e-4
     smoothed: bool = False
     diagnostics: dict[str, Any] = field(default_factory=dict)
+    alternatives: Alternatives = field(default_factory=Alternatives.none)
 
     def __len__(self) -> int:
         return len(self.time)
