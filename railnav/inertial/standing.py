@@ -139,8 +139,11 @@ def align_standing(
         raise EstimationError(f"run {run.id} has no IMU: there is nothing to align with")
     imu = run.imu
     w, f = body_axes(imu)
+    for finding in inspect_log(imu.time, imu.gyro, imu.specific_force):
+        if finding.kind not in ("gap", "axes"):
+            raise EstimationError(finding.sentence)
     for finding in inspect_log(imu.time, w, f):
-        if finding.kind != "gap":
+        if finding.kind == "axes":
             raise EstimationError(finding.sentence)
     stretch, remarks = _rest_of(run, w, f, between, shortest)
     rows = slice(stretch.first, stretch.last)
