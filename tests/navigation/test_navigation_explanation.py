@@ -107,5 +107,5 @@ def test_decisions_and_candidates_as_files(explained, tmp_path):
         solution.track_id[t] for t in solution.alternatives.track
     ]
     assert back.alternatives.probability == pytest.approx(solution.alternatives.probability)
-    with pytest.raises(InputError, match="use [.]jsonl or [.]csv"):
+    with pytest.raises(InputError, match=r"use \.jsonl or \.csv"):
         write_decisions(decisions, tmp_path / "why.txt")
