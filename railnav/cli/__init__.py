@@ -18,7 +18,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "demo": ("demo", "Simulate a survey and a service run, build, navigate, evaluate, and write a report."),
     "import": (
         "import_",
-        "Turn a track network (OpenStreetMap, GeoJSON, LandXML, elements CSV) into a reference track model.",
+        "Turn a track network (OpenStreetMap, GeoJSON, LandXML, railML, layers, elements) into a reference track model.",
     ),
     "build": ("build", "Build a reference track model from survey runs."),
     "update": ("update", "Refine a stored model with later runs; the old raw data are not needed."),
@@ -26,6 +26,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "navigate": ("navigate", "Place a run on a model: track, offset, speed, and how sure that is."),
     "evaluate": ("evaluate", "Compare a solution with the truth: errors along and across, track selection, integrity."),
     "monitor": ("monitor", "Work out track geometry channels from runs, and hold them against limits."),
+    "lining": ("lining", "Plan slews and lifts from the measured track to its design or a smoothed target."),
     "calibrate": (
         "calibrate",
         "Calibrate an inertial unit from positions: bias, scale and misalignment, with standard deviations.",
@@ -44,7 +45,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "validate": ("validate", "Check a model or a run and report every defect at once."),
     "datum": ("datum", "List datums, compare and pin their transformations, and fit one to common points."),
     "corridor": ("corridor", "Fit a low-distortion plane to a whole line, and write it as a frame file."),
-    "convert": ("convert", "Write a model or a solution in another format."),
+    "convert": ("convert", "Write a model, a solution, a run or a log in another format."),
     "view": ("view", "Draw a model or a solution as a picture or a page."),
 }
 

@@ -242,6 +242,20 @@ def write_model(model: TrackModel, path: Path) -> None:
     write_geopackage(model, path)
 
 
+def write_solution(solution: Solution, path: Path) -> None:
+    """Write a solution by its ending."""
+    if path.suffix.lower() == ".kml":
+        from railnav.io.kml import write_solution_kml
+
+        write_solution_kml(solution, path)
+    elif path.suffix.lower() == ".mfjson":
+        from railnav.io.moving_features import write_moving_features
+
+        write_moving_features(solution, path)
+    else:
+        solution.to_file(path)
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a page, whole or not at all."""
     from railnav.io.atomic import atomic_path

@@ -25,7 +25,7 @@ IntArray = NDArray[np.int64]
 ByteArray = NDArray[np.uint8]
 
 #: Formats of GNSS logs, as run.toml names them.
-LOG_FORMATS = ("nmea", "rtklib-pos", "ubx", "gpx")
+LOG_FORMATS = ("nmea", "rtklib-pos", "ubx", "gpx", "gpsd")
 #: A log with more than one broken row, and a larger share of them, is refused.
 MAX_BROKEN_SHARE = 0.1
 #: Bytes read at a time.
@@ -160,7 +160,7 @@ def read_log(path: str | Path, format: str, *, start: datetime) -> GnssLog:  # n
     path : path
         The log.
     format : str
-        "nmea", "rtklib-pos", "ubx" or "gpx".
+        "nmea", "rtklib-pos", "ubx", "gpx" or "gpsd".
     start : datetime
         Start of the run, with its time zone; times count from here.
 
@@ -225,7 +225,7 @@ def stream_log(
     path : path
         The log.
     format : str
-        "nmea", "rtklib-pos", "ubx" or "gpx".
+        "nmea", "rtklib-pos", "ubx", "gpx" or "gpsd".
     take : callable
         Called with every piece: stamps, ns since 1970 UTC, strictly growing also from piece to piece, and the columns that the piece
         carries, in the units of the table of formats.
@@ -334,6 +334,8 @@ def _reader(path: Path, format: str) -> Callable[..., Found]:  # noqa: A002
         from railnav.io.ubx import scan
     elif format == "gpx":
         from railnav.io.gpx import scan
+    elif format == "gpsd":
+        from railnav.io.gpsd import scan
     else:
         raise RunError(f"{format[:40]!r} is no format of GNSS logs; {', '.join(LOG_FORMATS)} are", file=path)
     return scan

@@ -517,9 +517,10 @@ def _balises(reader: _Reader, infrastructure: Any, model: TrackModel, index: dic
         spot = _spot(reader, node, model, index)
         if spot is not None:
             track, offset = spot
+            own = [label.get("entry") for label in children(node, "designator") if label.get("register") == "railnav"]
             found.append(
                 {
-                    "id": str(node.get("id", "")),
+                    "id": str(own[0] if own else node.get("id", "")),
                     "name": _name(node),
                     "track": model.track_id[track],
                     "offset_m": round(offset, 4),

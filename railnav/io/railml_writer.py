@@ -300,9 +300,11 @@ def _functional(model: TrackModel, relations: list[tuple[str, int, int, int, int
         for i, balise in enumerate(balises):
             t = model.track_index(str(balise["track"]))
             share = float(balise["offset_m"]) / float(model.lengths[t])
+            own = str(balise.get("id", ""))
+            label = f'<designator register="railnav" entry={quoteattr(own)}/>' if own else ""
             yield (
-                f'    <balise id="bal_{i + 1}"><name name={quoteattr(str(balise["name"]))} language="en"/>'
-                f"{_spot(f'bal_{i + 1}', t, share)}</balise>"
+                f'    <balise id="bal_{i + 1}"><name name={quoteattr(str(balise.get("name") or own))} language="en"/>'
+                f"{_spot(f'bal_{i + 1}', t, share)}{label}</balise>"
             )
         yield "   </balises>"
     stops = [(n, ends[n][0]) for n in np.flatnonzero(model.nodes.kind == NodeKind.BUFFER_STOP).tolist() if n in ends]

@@ -92,6 +92,9 @@ def test_a_model_comes_back_within_a_millimetre(tmp_path):
     again = read_railml(tmp_path / "line.railml")
     assert again.track_id == model.track_id
     assert again.line == model.line
+    for was, now in zip(model.provenance.get("balises", []), again.provenance["balises"], strict=True):
+        assert (was["id"], was["track"]) == (now["id"], now["track"])
+        assert now["offset_m"] == pytest.approx(was["offset_m"], abs=1e-3)
     assert again.nodes.id == model.nodes.id
     assert (again.nodes.kind == NodeKind.TURNOUT).sum() == (model.nodes.kind == NodeKind.TURNOUT).sum()
     assert {tuple(row) for row in again.movements.tolist()} == {tuple(row) for row in model.movements.tolist()}
