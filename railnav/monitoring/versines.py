@@ -243,7 +243,9 @@ def _restored(v: FloatArray, step: float, chord: Chord, band: Band, gain_of: obj
 def _steps(arm: float, step: float) -> int:
     count = round(arm / step)
     if count < 1 or abs(count * step - arm) > 1e-3 * arm:
-        raise TrackError(f"a chord's arm of {arm:g} m is no whole number of steps of {step:g} m; resample to a step that divides it")
+        raise TrackError(
+            f"a chord's arm of {arm:g} m is no whole number of steps of {step:g} m; resample to a step that divides it"
+        )
     return count
 
 
@@ -291,10 +293,14 @@ def hallade(measured: ArrayLike, designed: ArrayLike) -> HalladeSlews:
     """
     v_e, v_d = np.asarray(measured, float), np.asarray(designed, float)
     if v_e.shape != v_d.shape or v_e.ndim != 1 or len(v_e) < 3:
-        raise TrackError(f"{v_e.shape} measured and {v_d.shape} designed versines; two rows of equal length, at least 3, are needed")
+        raise TrackError(
+            f"{v_e.shape} measured and {v_d.shape} designed versines; two rows of equal length, at least 3, are needed"
+        )
     change = v_d - v_e
     if not np.isfinite(change).all():
-        raise TrackError(f"versine {int(np.argmin(np.isfinite(change)))} is not finite; cut the ends and gaps off first")
+        raise TrackError(
+            f"versine {int(np.argmin(np.isfinite(change)))} is not finite; cut the ends and gaps off first"
+        )
     slew = np.concatenate([[0.0], 2.0 * np.cumsum(np.cumsum(change[:-1]))])
     moment = float(np.arange(len(change)) @ change)
     closure = float(change.sum())
@@ -302,7 +308,7 @@ def hallade(measured: ArrayLike, designed: ArrayLike) -> HalladeSlews:
 
 
 def closed_versines(measured: ArrayLike, designed: ArrayLike) -> FloatArray:
-    """Designed versines corrected so that both closure sums vanish and the ends stay: the least change in squares.
+    """Designed versines whose first and last value are changed so that both closure sums vanish and the ends stay.
 
     Parameters
     ----------
@@ -312,9 +318,17 @@ def closed_versines(measured: ArrayLike, designed: ArrayLike) -> FloatArray:
     Returns
     -------
     (n,) array
-        Designed versines plus a straight line.
+
+    Examples
+    --------
+    >>> v_e = np.array([0.0, 0.010, 0.030, 0.010, 0.0])
+    >>> v_d = closed_versines(v_e, [0.0, 0.016, 0.016, 0.016, 0.0])
+    >>> v_d.round(3), hallade(v_e, v_d).slew.round(3)
+    (array([0.001, 0.016, 0.016, 0.016, 0.001]), array([0.   , 0.002, 0.016, 0.002, 0.   ]))
     """
-    v_e, v_d = np.asarray(measured, float), np.asarray(designed, float)
-    index = np.arange(len(v_e), dtype=float)
-    basis = np.column_stack([np.ones(len(v_e)), index])
-    return np.asarray(v_d - basis @ np.linalg.solve(basis.T @ basis, basis.T @ (v_d - v_e)))
+    v_e, v_d = np.asarray(measured, float), np.array(designed, float)
+    change = v_d - v_e
+    last = -float(np.arange(len(change)) @ change) / (len(change) - 1)
+    v_d[0] += -float(change.sum()) - last
+    v_d[-1] += last
+    return v_d

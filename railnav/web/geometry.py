@@ -362,9 +362,9 @@ def _lead(report: Report, shown: Sequence[Exceedance]) -> str:
             c for p in report.sections for g in p.geometries for key, c in g.channels.items() if key == "plan_deviation"
         ]
         if long:
-            best = min(long, key=lambda c: c.sigma)
+            best = max(long, key=lambda c: int(np.isfinite(c.values).sum()))
             text += f"What these runs can show is the distance from the model in long waves ({best.title.split(', ')[-1]}), "
-            text += f"within {words.length(best.sigma, 2)} at best."
+            text += f"within {words.length(best.sigma, 2)} for the longest."
         return text
     severe = sum(e.level == "immediate" for e in shown)
     text += f"Held against limits: {', '.join(judged).lower()}. "

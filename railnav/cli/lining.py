@@ -1,0 +1,193 @@
+"""`railnav lining`: slews and lifts for the tamping machine."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from railnav.cli._verb import PATH, json_option
+
+if TYPE_CHECKING:
+    from railnav.monitoring.lining import LiningPlan
+
+TABLE_ENDINGS = (".csv", ".parquet")
+
+
+@click.command("lining")
+@click.argument("runs", type=PATH, nargs=-1, required=True, metavar="RUN...")
+@click.option("-m", "--model", type=PATH, required=True, help="Reference track model, .gpkg (or .geojson).")
+@click.option("-o", "--output", type=PATH, required=True, help="Plan to write: .csv or .parquet.")
+@click.option(
+    "--design", type=PATH, help="Design to reach: LandXML (.xml) or elements (.csv).  [default: a smoothed target]"
+)
+@click.option("--design-crs", help="Plane of the design, where its file does not say.  [default: the model's]")
+@click.option("--report", type=PATH, help="Also write a page about the plan, .html.")
+@click.option(
+    "--tracks",
+    metavar="TRACK,TRACK",
+    help="The section: tracks in order.  [default: the longest way that a run covers]",
+)
+@click.option(
+    "--step", type=click.FloatRange(0.5, 20), default=5.0, show_default=True, help="Distance between slews, m."
+)
+@click.option(
+    "--cutoff",
+    type=click.FloatRange(20, 500),
+    default=100.0,
+    show_default=True,
+    help="Wavelength that a smoothed target halves, m.",
+)
+@click.option(
+    "--fixed", type=PATH, help="Fixed points: .csv with track, offset_m, slew_mm, slew_tolerance_mm, lift_mm, ..."
+)
+@click.option(
+    "--most-slew", type=click.FloatRange(0, 1000), default=100.0, show_default=True, help="Greatest slew, mm."
+)
+@click.option(
+    "--least-lift", type=click.FloatRange(-1000, 1000), default=0.0, show_default=True, help="Least lift, mm."
+)
+@click.option(
+    "--most-lift", type=click.FloatRange(0, 1000), default=100.0, show_default=True, help="Greatest lift, mm."
+)
+@click.option(
+    "--curvature-rate",
+    type=click.FloatRange(0, 1e-2, min_open=True),
+    default=5e-6,
+    show_default=True,
+    help="Greatest change of curvature that what is left may add, in plan and profile, 1/m^2.",
+)
+@json_option
+def command(
+    runs: tuple[Path, ...],
+    model: Path,
+    output: Path,
+    design: Path | None,
+    design_crs: str | None,
+    report: Path | None,
+    tracks: str | None,
+    step: float,
+    cutoff: float,
+    fixed: Path | None,
+    most_slew: float,
+    least_lift: float,
+    most_lift: float,
+    curvature_rate: float,
+    as_json: bool,
+) -> None:
+    """Plan slews and lifts from the track as measured to its design, or to a smoothed target.
+
+    The track is measured by the RUNs' positions and angles where they are good enough, otherwise the model's own axis is taken; the plan
+    says which, and how good it is. Slews are to the right as the distance grows. Fixed points, the greatest slew, lifts that only lift
+    and the change of curvature are kept exactly (linear programme); the classic versine method stands beside it.
+
+    \b
+    Example:
+      railnav lining demo/survey-1 demo/survey-2 -m demo/line.gpkg -o plan.csv --report plan.html
+    """  # noqa: D301
+    from railnav.cli import _files
+    from railnav.cli._terminal import print_json, print_warnings, progress
+    from railnav.errors import InputError
+
+    inputs = [
+        model,
+        *(path for path in (design, fixed) if path is not None),
+        *(member for run in runs for member in _files.members(run)),
+    ]
+    _files.check_output(output, TABLE_ENDINGS, inputs=inputs)
+    if report is not None:
+        _files.check_output(report, _files.PAGE_ENDINGS, inputs=[*inputs, output])
+        _files.need_report()
+    if least_lift > most_lift:
+        raise click.UsageError(f"--least-lift {least_lift:g} is above --most-lift {most_lift:g}")
+    from railnav.io.lining import read_fixed_points, write_plan
+    from railnav.io.run import read_run
+    from railnav.monitoring.lining import LiningLimits, line_up
+    from railnav.monitoring.survey_section import measured_section
+
+    reference = _files.read_model(model)
+    designs: Any = ()
+    if design is not None:
+        from railnav.io.designs import read_designs
+
+        designs = read_designs(design, crs=design_crs or reference.frame.crs_wkt)
+        if not designs:
+            raise InputError("holds no alignment", file=design)
+    names = [name.strip() for name in tracks.split(",") if name.strip()] if tracks is not None else []
+    limits = LiningLimits(most_slew / 1e3, least_lift / 1e3, most_lift / 1e3, curvature_rate, curvature_rate)
+    with progress() as tell:
+        axis, surveyed = measured_section([read_run(run) for run in runs], reference, tracks=names, progress=tell)
+        slews, lifts = read_fixed_points(fixed, axis.section) if fixed is not None else ((), ())
+        if tell:
+            tell("line", 0, 1)
+        plan = line_up(
+            axis,
+            designs=designs,
+            step=step,
+            cutoff=cutoff,
+            limits=limits,
+            fixed_slew=slews,
+            fixed_lift=lifts,
+            smooth_base=surveyed,
+        )
+        if tell:
+            tell("line", 1, 1)
+    page = None
+    if report is not None:
+        from railnav.web.lining import lining_page
+
+        page = lining_page(plan)
+    write_plan(plan, output)
+    if report is not None and page is not None:
+        _files.write_text(report, page)
+    if as_json:
+        print_json({**facts(plan), "output": output, "report": report})
+        return
+    print_warnings(plan.notes)
+    _print(plan)
+    click.echo(f"{', '.join(str(path) for path in (output, report) if path is not None)} written")
+
+
+def facts(plan: LiningPlan) -> dict[str, Any]:
+    """The plan as plain facts."""
+    return {
+        "section": plan.section.name,
+        "length_m": float(plan.distance[-1] - plan.distance[0]),
+        "nodes": len(plan.distance),
+        "design": plan.design or None,
+        "cutoff_m": plan.cutoff,
+        "runs": list(plan.measured.runs),
+        "sigma_right_mm": 1e3 * plan.measured.sigma_right,
+        "sigma_up_mm": 1e3 * plan.measured.sigma_up,
+        "usable": plan.usable,
+        "greatest_slew_mm": 1e3 * float(abs(plan.slew).max()),
+        "mean_slew_mm": 1e3 * float(abs(plan.slew).mean()),
+        "greatest_lift_mm": 1e3 * float(plan.lift.max()),
+        "spread_mm": {f"{name} {band}": [1e3 * a, 1e3 * b] for (name, band), (a, b) in plan.spread.items()},
+        "notes": list(plan.notes),
+    }
+
+
+def _print(plan: LiningPlan) -> None:
+    from railnav.cli._terminal import print_facts, print_table
+    from railnav.web import words
+
+    print_facts(
+        f"Lining of {plan.section.name}",
+        {
+            "target": f"design {plan.design}"
+            if plan.design
+            else f"smoothed, waves under {plan.cutoff:.0f} m taken out",
+            "length": words.length(float(plan.distance[-1] - plan.distance[0]), 5),
+            "measured by": ", ".join(plan.measured.runs) or "the model's own axis",
+            "good to": f"{words.length(plan.measured.sigma_right, 2)} across, {words.length(plan.measured.sigma_up, 2)} in height",
+            "greatest slew": words.length(float(abs(plan.slew).max()), 3),
+            "greatest lift": words.length(float(plan.lift.max()), 3),
+        },
+    )
+    rows = [
+        [name.replace("_", " "), band, f"{1e3 * before:.2f} mm", f"{1e3 * after:.2f} mm"]
+        for (name, band), (before, after) in plan.spread.items()
+    ]
+    print_table("Standard deviation", ("channel", "band", "before", "after"), rows, left=2)

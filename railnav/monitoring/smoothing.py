@@ -1,0 +1,300 @@
+"""Targets for lining: the Whittaker smoother, and slews of least size under limits, by linear programming."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from railnav.errors import RailnavError, TrackError
+
+FloatArray = NDArray[np.float64]
+
+
+class InfeasibleError(RailnavError):
+    """Limits and fixed points of a lining plan that contradict each other; the message names them."""
+
+
+@dataclass(frozen=True, slots=True)
+class FixedPoint:
+    """A place whose correction is prescribed.
+
+    Attributes
+    ----------
+    name : str
+        For messages.
+    start, finish : float
+        Distance along the section; equal for a single place, m.
+    correction : float
+        Slew to the right, or lift, m.
+    tolerance : float
+        The correction may differ by this either way, m.
+    """
+
+    name: str
+    start: float
+    finish: float
+    correction: float = 0.0
+    tolerance: float = 0.0
+
+
+def whittaker(values: ArrayLike, step: float, cutoff: float, *, weight: ArrayLike | None = None) -> FloatArray:
+    """Whittaker smoother with third differences: least squares between staying and running smoothly.
+
+    Minimises sum w (y - x)^2 + lambda sum (third difference of x)^2, lambda = (cutoff / 2 pi step)^6: a wave of the cut-off length is
+    halved, |H| = 1 / (1 + (cutoff / L)^6), zero phase; parabolas (circular curves) pass untouched.
+
+    Parameters
+    ----------
+    values : (n,) array
+        m; NaN is filled in by the smoothness.
+    step, cutoff : float
+        m.
+    weight : (n,) array, optional
+        Of each value; 1 by default.
+
+    Returns
+    -------
+    (n,) array
+
+    References
+    ----------
+    docs/theory/geometry.md (12); Eilers, Anal. Chem. 75 (2003).
+
+    Examples
+    --------
+    >>> s = np.arange(0.0, 2000.0)
+    >>> wave = np.sin(2 * np.pi * s / 100.0)
+    >>> float(np.abs(whittaker(wave, 1.0, 100.0)[500:1500]).max().round(2))
+    0.5
+    """
+    from scipy.linalg import LinAlgError, solveh_banded
+
+    y = np.asarray(values, float)
+    n = len(y)
+    if n < 8:
+        raise TrackError(f"{n} values are too few to smooth")
+    if not cutoff > 2.0 * step:
+        raise TrackError(f"a cut-off of {cutoff} m is too short for a step of {step} m")
+    w = np.where(np.isfinite(y), 1.0 if weight is None else np.asarray(weight, float), 0.0)
+    strength = (cutoff / (2.0 * math.pi * step)) ** 6
+    stencil = np.array([-1.0, 3.0, -3.0, 1.0])
+    band = np.zeros((4, n))
+    for i in range(4):
+        for j in range(i, 4):
+            band[3 - (j - i), j : n - 3 + j] += strength * stencil[i] * stencil[j]
+    band[3] += w
+    try:
+        return np.asarray(solveh_banded(band, w * np.where(w > 0.0, np.nan_to_num(y), 0.0)))
+    except LinAlgError as error:
+        raise TrackError("too few values are known to smooth between") from error
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """What a tamping machine may do.
+
+    Attributes
+    ----------
+    least, most : float
+        Correction, m: of slews -most to most; of lifts e.g. 0 to most, for a machine that cannot lower.
+    third_difference : float
+        Greatest third derivative of what is left of the deviation (of curvature: its rate), 1/m^2.
+    ends : bool
+        Whether the correction is zero at both ends, so that the work joins the track beyond.
+    """
+
+    least: float
+    most: float
+    third_difference: float
+    ends: bool = True
+
+
+def corrections(
+    deviation: ArrayLike,
+    target: ArrayLike,
+    step: float,
+    bounds: Bounds,
+    *,
+    fixed: Sequence[FixedPoint] = (),
+    start: float = 0.0,
+) -> FloatArray:
+    """Corrections that bring a deviation as near to its target as limits allow: a linear programme.
+
+    minimise sum |r - t|, r = y + e, subject to least <= e <= most, |third difference of r| <= J step^3, e within the tolerance of each
+    fixed point, e = 0 at the ends. Solved exactly by HiGHS.
+
+    Parameters
+    ----------
+    deviation : (n,) array
+        y: measured minus design (or minus a smooth base), m, at uniform distances.
+    target : (n,) array
+        t: what it should become, m; zero to reach the design.
+    step : float
+        m.
+    bounds : Bounds
+    fixed : sequence of FixedPoint
+    start : float
+        Distance of the first value, m: that of fixed points counts from the same zero.
+
+    Returns
+    -------
+    (n,) array
+        Corrections e, m.
+
+    Raises
+    ------
+    InfeasibleError
+        No correction satisfies all limits; the message names a smallest set of fixed points that contradict each other, or says that the
+        limits do so by themselves, and where.
+
+    References
+    ----------
+    docs/theory/geometry.md (13).
+
+    Examples
+    --------
+    >>> bump = 0.02 * np.exp(-(((np.arange(61) - 30.0) / 3.0) ** 2))
+    >>> e = corrections(bump, np.zeros(61), 1.0, Bounds(-0.05, 0.05, 1e-4))
+    >>> bool(abs(bump + e).max() < 1e-6)
+    True
+    """
+    y, t = np.asarray(deviation, float), np.asarray(target, float)
+    n = len(y)
+    if n < 8 or y.shape != t.shape or not (np.isfinite(y).all() and np.isfinite(t).all()):
+        raise TrackError(f"{y.shape} deviations and {t.shape} targets; two rows of at least 8 finite values are needed")
+    low, high = np.full(n, bounds.least), np.full(n, bounds.most)
+    if bounds.ends:
+        low[[0, -1]] = high[[0, -1]] = 0.0
+    spans = [_rows(point, start, step, n) for point in fixed]
+    inside = [(point, span) for point, span in zip(fixed, spans, strict=True) if span.stop > span.start]
+    lows, highs = low.copy(), high.copy()
+    for point, span in inside:
+        lows[span] = np.maximum(lows[span], point.correction - point.tolerance)
+        highs[span] = np.minimum(highs[span], point.correction + point.tolerance)
+    solved = _solve(y, t, lows, highs, bounds.third_difference * step**3) if (lows <= highs + 1e-12).all() else None
+    if solved is not None:
+        return np.clip(solved, lows, np.maximum(lows, highs))
+    raise InfeasibleError(_why(y, step, start, low, high, bounds, inside))
+
+
+def _rows(point: FixedPoint, start: float, step: float, n: int) -> slice:
+    """Rows that a fixed point holds: at least the nearest one where it lies on the section."""
+    first, last = (point.start - start) / step, (point.finish - start) / step
+    if last < -0.5 or first > n - 0.5:
+        return slice(0, 0)
+    a, b = math.ceil(first - 1e-9), math.floor(last + 1e-9)
+    if b < a:
+        a = b = round(0.5 * (first + last))
+    return slice(max(a, 0), min(b, n - 1) + 1)
+
+
+def _differences(n: int) -> Any:
+    from scipy.sparse import diags_array
+
+    return diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(n - 3, n), format="csr")
+
+
+def _solve(y: FloatArray, t: FloatArray, low: FloatArray, high: FloatArray, jump: float) -> FloatArray | None:
+    """The programme in millimetres: r = t + p - q with p, q >= 0; None where it has no solution."""
+    from scipy.optimize import linprog
+    from scipy.sparse import hstack, vstack
+
+    n = len(y)
+    scale = 1e3
+    D = _differences(n)
+    # e = r - y, so that p - q = e + y - t lies between low + y - t and high + y - t
+    least, most = scale * (low + y - t), scale * (high + y - t)
+    over, under = np.maximum(most, 0.0), np.maximum(-least, 0.0)
+    cost = np.ones(2 * n)
+    both = hstack([D, -D])
+    shape = scale * np.asarray(D @ t)
+    bound = scale * jump
+    answer = linprog(
+        cost,
+        A_ub=vstack([both, -both]),
+        b_ub=np.concatenate([bound - shape, bound + shape]),
+        bounds=np.column_stack(
+            [np.concatenate([np.maximum(least, 0.0), np.maximum(-most, 0.0)]), np.concatenate([over, under])]
+        ),
+        method="highs",
+    )
+    if answer.status == 2:
+        return None
+    if answer.status != 0:
+        raise TrackError(f"the linear programme was not solved ({answer.message})")
+    return np.asarray((answer.x[:n] - answer.x[n:]) / scale + t - y)
+
+
+def feasible(y: FloatArray, low: FloatArray, high: FloatArray, jump: float) -> bool:
+    """Whether corrections within low and high leave third differences of y + e within a bound."""
+    from scipy.optimize import linprog
+    from scipy.sparse import vstack
+
+    if (low > high + 1e-12).any():
+        return False
+    n, scale = len(y), 1e3
+    D = _differences(n)
+    shape = scale * np.asarray(D @ y)
+    answer = linprog(
+        np.zeros(n),
+        A_ub=vstack([D, -D]),
+        b_ub=np.concatenate([scale * jump - shape, scale * jump + shape]),
+        bounds=np.column_stack([scale * low, scale * np.maximum(high, low)]),
+        method="highs",
+    )
+    return bool(answer.status == 0)
+
+
+def _why(
+    y: FloatArray,
+    step: float,
+    start: float,
+    low: FloatArray,
+    high: FloatArray,
+    bounds: Bounds,
+    inside: Sequence[tuple[FixedPoint, slice]],
+) -> str:
+    """Name a smallest set of fixed points that cannot be met together (deletion filter), or say where the limits alone fail."""
+    jump = bounds.third_difference * step**3
+
+    def possible(kept: Sequence[int]) -> bool:
+        lows, highs = low.copy(), high.copy()
+        for k in kept:
+            point, span = inside[k]
+            lows[span] = np.maximum(lows[span], point.correction - point.tolerance)
+            highs[span] = np.minimum(highs[span], point.correction + point.tolerance)
+        return feasible(y, lows, highs, jump)
+
+    if not possible([]):
+        window = max(16, round(200.0 / step))
+        for a in range(0, max(len(y) - window, 1), max(window // 2, 1)):
+            part = slice(a, min(a + window, len(y)))
+            if not feasible(y[part], low[part], high[part], jump):
+                where = f"between {start + a * step:.0f} and {start + (part.stop - 1) * step:.0f} m"
+                break
+        else:
+            where = "over the whole section"
+        return (
+            f"no correction between {1e3 * bounds.least:+.0f} and {1e3 * bounds.most:+.0f} mm leaves a curvature rate of at most "
+            f"{bounds.third_difference:.1e} 1/m^2 {where}, even without fixed points; allow more of either"
+        )
+    kept = list(range(len(inside)))
+    kept.sort(key=lambda k: inside[k][0].start)
+    for k in list(kept):
+        rest = [other for other in kept if other != k]
+        if rest and not possible(rest):
+            kept = rest
+    names = []
+    for k in kept:
+        point = inside[k][0]
+        names.append(
+            f"{point.name!r} at {point.start:.1f} m ({1e3 * point.correction:+.1f} +- {1e3 * point.tolerance:.1f} mm)"
+        )
+    if len(names) == 1:
+        return f"fixed point {names[0]} cannot be met under the limits of correction and curvature rate; widen its tolerance or them"
+    return f"fixed points {', '.join(names[:-1])} and {names[-1]} contradict each other under the limits; widen a tolerance or drop one"
