@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from railnav.errors import RunError
 from railnav.survey import report, surveyed
+from railnav.survey.angles import slopes_of
 from railnav.survey.axis import solve, sweep
 from railnav.survey.fixes import Fixes, gather
 from railnav.survey.grouping import tracks_of_line
@@ -277,6 +278,7 @@ def _estimated(
         chains = []
         for t in tracks:
             surveyed.reject(t, offsets.run, slack)
+            t.slopes = slopes_of(t, t.axis)
             if t.noise_level == 0.0:
                 t.noise_level = surveyed.choose_noise(surveyed.cross_chain(t, offsets.run, slack, level=1e-4))
             chains.append(surveyed.cross_chain(t, offsets.run, slack))
@@ -288,7 +290,7 @@ def _estimated(
                 chains[i], swept[i], offsets.run.ravel()[who], offsets.covariance[np.ix_(who, who)], sure=True
             )
             t.axis = t.estimate.state[:, 0]
-            t.noise = surveyed.local_noise(t.estimate, t.noise_level, t.nominal.step)
+            t.noise = surveyed.free_in_gaps(t, surveyed.local_noise(t.estimate, t.noise_level, t.nominal.step))
             tracks[i] = surveyed.relaid(t, survey.fixes) if turn < RELAID else surveyed.cut_ends(t)
     tell("estimate", ROUNDS, ROUNDS)
     return tracks, offsets

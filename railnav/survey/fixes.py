@@ -63,6 +63,10 @@ class Fixes:
         Reference point to antenna along the vehicle, m; 0 where the attitude is known and the antenna already brought down.
     right : (m,) array
         The same to the vehicle's right, leaning with the cant where it was measured, m.
+    angles : (time, grid bearing, pitch) arrays or None
+        Where the run has gyroscopic angles: s, rad from grid north, unwrapped, and rad.
+    odometer : (time, distance) arrays or None
+        Where it has an odometer: s and m.
     """
 
     run: Run
@@ -76,6 +80,8 @@ class Fixes:
     size: FloatArray
     forward: float
     right: FloatArray
+    angles: tuple[FloatArray, FloatArray, FloatArray] | None = None
+    odometer: tuple[FloatArray, FloatArray] | None = None
 
     def __len__(self) -> int:
         return len(self.time)
@@ -143,7 +149,33 @@ def gather(run: Run, frame: GridFrame) -> Fixes:
         size=size,
         forward=forward,
         right=right,
+        angles=_angles(run, frame, np.asarray(gnss.time), east, north),
+        odometer=_odometer(run),
     )
+
+
+def _angles(
+    run: Run, frame: GridFrame, time: FloatArray, east: FloatArray, north: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Gyroscopic angles as grid bearing and pitch: the convergence of the place is taken off."""
+    angles = run.gyro_angles
+    if angles is None or len(angles.time) < 2:
+        return None
+    turn = np.interp(angles.time, time, frame.convergence(east, north))
+    return np.asarray(angles.time), np.unwrap(angles.heading) - turn, np.asarray(angles.pitch)
+
+
+def _odometer(run: Run) -> tuple[FloatArray, FloatArray] | None:
+    """Distance run by time; a speed is summed up."""
+    odometer = run.odometer
+    if odometer is None or len(odometer.time) < 2:
+        return None
+    if odometer.distance is not None:
+        return np.asarray(odometer.time), np.asarray(odometer.distance)
+    if odometer.speed is None:
+        return None
+    mean = 0.5 * (odometer.speed[1:] + odometer.speed[:-1])
+    return np.asarray(odometer.time), np.append(0.0, np.cumsum(mean * np.diff(odometer.time)))
 
 
 def _lowered(

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from railnav.estimation.gross_error import chi_square_limit
 from railnav.estimation.merging import ChainRecords, change_test
 from railnav.survey import _kernels, surveyed
-from railnav.survey.axis import Chain, ErrorModel, Estimate, Links, smooth_links, solve, sweep
+from railnav.survey.angles import slopes_of
+from railnav.survey.axis import Chain, ErrorModel, Estimate, Links, Slopes, smooth_links, solve, sweep
 from railnav.survey.fixes import CONTRADICTS, USED
 from railnav.survey.offsets import HOLD, RECEIVER_PRIOR, SCATTER_DOF, Knowledge, robust_fit
 from railnav.survey.surveyed import GROSS_RATIO, TRACKS_APART, Surveyed, white_variances
@@ -89,6 +90,8 @@ class Side:
     axis : (N,) array
         Where the axis is taken to be, less the stored one, m.
     design : (N, B) array
+    base : (N,) array
+        Stored heights, m; zero across.
     changes : list of Change
     excluded : (N,) bool array or None
         Nodes where the new runs are not used.
@@ -100,6 +103,7 @@ class Side:
     up: bool
     axis: FloatArray
     design: FloatArray
+    base: FloatArray
     changes: list[Change] = field(default_factory=list)
     excluded: BoolArray | None = None
     estimate: Estimate | None = None
@@ -136,7 +140,19 @@ class Side:
             errors=self.errors,
             bend=np.zeros(len(t.nominal)) if self.up else t.nominal.curvature,
             noise=self.stored.noise,
+            slopes=self.slopes(),
         )
+
+    def slopes(self) -> Slopes | None:
+        """What the gyroscopic angles of the new runs say about the stored axis; not where the runs are set aside."""
+        # in height gradients count from the stored profile, as values do
+        found = slopes_of(self.track, self.axis + self.base if self.up else self.axis, up=self.up)
+        if found is None:
+            return None
+        value = found.value - np.gradient(self.base, self.track.nominal.step) if self.up else found.value
+        if self.excluded is not None:
+            value = np.where(self.excluded, np.nan, value)
+        return replace(found, value=value) if np.isfinite(value).any() else None
 
     def first_offsets(self) -> Knowledge:
         """First knowledge of the frame offsets: robust, from the distances to the stored axis."""

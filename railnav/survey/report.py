@@ -52,6 +52,8 @@ NEAR = 60.0
 WEAK = 2.0
 #: Shorter stretches are not worth a survey, m; more than this many are not listed.
 SHORTEST_AGAIN, MOST_AGAIN = 50.0, 100
+#: An antenna higher than this above the rails leans noticeably with the cant, m.
+LEAN_HEIGHT = 0.3
 #: Receivers differ when their offsets stand this many sigma apart.
 SIGNIFICANT = 3.0
 
@@ -417,6 +419,15 @@ def _warnings(
         out.append(
             f"no two runs of one track let the errors of {', '.join(sorted(survey.assumed))} be checked: they are assumed from the "
             "stated sigmas"
+        )
+    leaning = [f for f in survey.fixes if f.run.gnss is not None and abs(f.run.gnss.lever_arm_b[2]) > LEAN_HEIGHT]
+    leaning = [f for f in leaning if f.angles is None and (f.run.gauge is None or f.run.gauge.cant is None)]
+    if leaning:
+        high = max(abs(float(f.run.gnss.lever_arm_b[2])) for f in leaning if f.run.gnss is not None)
+        out.append(
+            f"{len(leaning)} runs carry the antenna up to {high:.1f} m above the rails and measure neither attitude nor cant: in a curve "
+            f"with 100 mm of cant it leans {100 * high * 0.1 / 1.5:.0f} cm to the inside, and the axis with it; give gyro_angles or "
+            "gauge with cant"
         )
     frames = sorted({f.run.gnss.frame for f in survey.fixes if f.run.gnss is not None})
     if len(frames) > 1:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railnav.survey import _kernels
-from railnav.survey.axis import Chain, ErrorModel, Estimate, Swept, log_evidence
+from railnav.survey.axis import Chain, ErrorModel, Estimate, Slopes, Swept, log_evidence
 from railnav.survey.fixes import GROSS, OTHER_TRACK, USED, Fixes
 from railnav.survey.noise import Sample
 from railnav.survey.nominal import Nominal
@@ -39,6 +39,8 @@ TRACKS_APART = 1.5
 NOISES = (1e-6, 3e-6, 1e-5, 3e-5, 1e-4, 3e-4, 1e-3)
 #: It is chosen on so many windows of so many nodes at most.
 WINDOWS, WINDOW_NODES = 6, 400
+#: A stretch without any measurement is longer than this, m; there curvature noise is that of the livelier parts (quantile).
+BLIND, LIVELY = 60.0, 0.95
 #: Degrees of freedom and reach, m, with which the curvature noise follows the track.
 LOCAL_DOF, LOCAL_REACH = 2.0, 30.0
 
@@ -67,6 +69,8 @@ class Surveyed:
         Curvature noise between nodes.
     estimate : Estimate or None
         The last estimate, relative to `nominal`.
+    slopes : Slopes or None
+        What gyroscopic angles say.
     """
 
     name: str
@@ -79,6 +83,7 @@ class Surveyed:
     noise_level: float = 0.0
     noise: FloatArray = field(default_factory=lambda: np.zeros(0))
     estimate: Estimate | None = None
+    slopes: Slopes | None = None
 
     @property
     def design(self) -> FloatArray:
@@ -136,6 +141,7 @@ def cut_ends(track: Surveyed) -> Surveyed:
         axis=track.axis[keep],
         noise=track.noise[a:b],
         estimate=e,
+        slopes=None if track.slopes is None else track.slopes.part(a, b + 1),
     )
 
 
@@ -288,6 +294,7 @@ def cross_chain(track: Surveyed, offset: FloatArray, slack: float, level: float 
         errors=track.errors,
         bend=track.nominal.curvature,
         noise=noise,
+        slopes=track.slopes,
     )
 
 
@@ -341,6 +348,20 @@ def local_noise(estimate: Estimate, level: float, step: float) -> FloatArray:
     power = np.convolve(estimate.step_power / step, box, mode="same")
     many = np.convolve(np.ones(len(estimate.step_power)), box, mode="same")
     return np.sqrt((LOCAL_DOF * level**2 + power) / (LOCAL_DOF + many))
+
+
+def free_in_gaps(track: Surveyed, noise: FloatArray) -> FloatArray:
+    """Where nothing was measured the track may bend as it does elsewhere: curvature noise no less than in its livelier parts."""
+    seen = track.profile.present.any(axis=0)
+    if track.slopes is not None:
+        seen |= np.isfinite(track.slopes.value).any(axis=0)
+    at = np.flatnonzero(seen)
+    out = noise.copy()
+    lively = float(np.quantile(noise, LIVELY))
+    for a, b in pairwise(at.tolist()):
+        if (b - a) * track.nominal.step > BLIND:
+            out[a:b] = np.maximum(out[a:b], lively)
+    return out
 
 
 def know(track: Surveyed, swept: Swept) -> Knowledge:

@@ -219,7 +219,10 @@ def _known_model(records: ModelRecords, receiver: str, survey: Survey, coordinat
 
 
 def _side_across(t: Surveyed, records: ModelRecords) -> Side:
-    return Side(track=t, stored=records.tracks[t.name].across, up=False, axis=np.zeros(len(t.nominal)), design=t.design)
+    zero = np.zeros(len(t.nominal))
+    return Side(
+        track=t, stored=records.tracks[t.name].across, up=False, axis=zero.copy(), design=t.design, base=zero.copy()
+    )
 
 
 def _side_up(t: Surveyed, records: ModelRecords) -> Side | None:
@@ -230,7 +233,9 @@ def _side_up(t: Surveyed, records: ModelRecords) -> Side | None:
     if part is None:
         return None
     N = len(t.nominal)
-    return Side(track=part, stored=stored.up, up=True, axis=np.zeros(N), design=np.ones((N, 1)))
+    return Side(
+        track=part, stored=stored.up, up=True, axis=np.zeros(N), design=np.ones((N, 1)), base=np.array(stored.height)
+    )
 
 
 @dataclass(slots=True, eq=False)

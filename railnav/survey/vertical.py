@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from railnav.survey.angles import slopes_of
 from railnav.survey.axis import Chain, ErrorModel, Estimate, solve, sweep
 from railnav.survey.noise import Sample, error_models, run_models
 from railnav.survey.offsets import Knowledge, Offsets, differences, settle
@@ -72,7 +73,12 @@ def estimate_heights(
         rows = np.flatnonzero(has.any(axis=1))
         if not len(rows) or _reached(has, track).mean() < SHARE_WITH_HEIGHTS:
             continue
-        part = replace(track, runs=tuple(track.runs[k] for k in rows), profile=_rows(P, rows))
+        part = replace(
+            track,
+            runs=tuple(track.runs[k] for k in rows),
+            laid=[track.laid[k] for k in rows],
+            profile=_rows(P, rows),
+        )
         level = float(np.nanmedian(value[rows]))
         N = len(track.nominal)
         chain = Chain(
@@ -114,6 +120,7 @@ def estimate_heights(
             wild = np.abs(residual) > GROSS_RATIO * total + slack
             rejected[w] = int(np.count_nonzero(wild))
             chain.variance[wild] = np.nan
+            chain.slopes = slopes_of(part, axes[w], up=True)
             if turn == 0:
                 levels[w] = choose_noise(chain)
                 chain.noise = np.full(len(chain.noise), levels[w])

@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 from scipy.spatial import cKDTree
 
 from railnav.geodesy.grid import GridFrame, choose_frame
-from railnav.run import GnssStream, Run
+from railnav.run import GnssStream, GyroAnglesStream, OdometerStream, Run
 
 START = datetime(2026, 5, 4, 8, tzinfo=UTC)
 
@@ -92,6 +92,43 @@ class Receiver:
     stated: float | None = 1.0
 
 
+@dataclass(frozen=True)
+class Gyros:
+    """Gyroscopic angles and odometer: white sigma of a reading and bias, rad; walk, rad per sqrt(s); scale error of the odometer."""
+
+    white: float = 2e-4
+    bias: float = 2e-3
+    walk: float = 1e-5
+    scale: float = 5e-4
+
+    def streams(self, axis: Axis, frame: GridFrame, rng, time, s, backwards: bool) -> dict:
+        """The streams of a drive that was at offset s at each time."""
+        dt = np.diff(time, prepend=time[0])
+
+        def wrong():
+            return (
+                self.bias * rng.standard_normal()
+                + np.cumsum(self.walk * np.sqrt(dt) * rng.standard_normal(len(time)))
+                + self.white * rng.standard_normal(len(time))
+            )
+
+        east, north, _ = axis.at(s)
+        # bearing and gradient of the shifted track itself, not of the line's centre
+        tangent = np.arctan2(np.gradient(axis.east), np.gradient(axis.north))
+        bearing = np.interp(s, axis.arc, np.unwrap(tangent)) + (np.pi if backwards else 0.0)
+        slope = np.interp(s, axis.arc, np.gradient(axis.height, axis.arc)) * (-1.0 if backwards else 1.0)
+        heading = bearing + frame.convergence(east, north)
+        return {
+            "gyro_angles": GyroAnglesStream(
+                time=time, roll=np.zeros(len(time)), pitch=np.arctan(slope) + wrong(), heading=heading + wrong()
+            ),
+            "odometer": OdometerStream(
+                time=time,
+                distance=np.cumsum(np.abs(np.diff(s, prepend=s[0]))) * (1.0 + self.scale * rng.standard_normal()),
+            ),
+        }
+
+
 SURVEY = Receiver()
 PHONE = Receiver("phone", white=0.8, correlated=2.5, memory=40.0, rate=1.0)
 
@@ -103,9 +140,10 @@ def plane() -> GridFrame:
 
 def drive(
     axis: Axis, frame: GridFrame, rng, *, run_id: str, direction: str = "", receiver: Receiver = SURVEY, speed: float = 22.0,
-    stop: float = 120.0, begin: float = 0.0, end: float = 1.0, backwards: bool = False, day: int = 0,
+    stop: float = 120.0, begin: float = 0.0, end: float = 1.0, backwards: bool = False, day: int = 0, gyros: Gyros | None = None,
+    tunnels: tuple[tuple[float, float], ...] = (),
 ) -> Run:  # fmt: skip
-    """One drive over a part of a track, with one stop."""
+    """One drive over a part of a track, with one stop; no fixes in `tunnels` (shares of the track)."""
     length = axis.arc[-1]
     v = speed * rng.uniform(0.85, 1.15)
     travel = (end - begin) * length / v
@@ -140,7 +178,13 @@ def drive(
         sigma_north=total * receiver.stated if says else None,
         receiver=receiver.name,
     )
-    return Run(id=run_id, start=START.replace(day=4 + day), direction=direction, gnss=stream)
+    run = Run(id=run_id, start=START.replace(day=4 + day), direction=direction, gnss=stream)
+    if gyros is not None:
+        run = replace(run, **gyros.streams(axis, frame, rng, time, s, backwards))
+    dark = np.zeros(len(s), bool)
+    for a, b in tunnels:
+        dark |= (s > a * length) & (s < b * length)
+    return only(run, ~dark) if dark.any() else run
 
 
 def double_line(
