@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from railnav.errors import TrackError
+from railnav.errors import EstimationError, TrackError
 from railnav.monitoring.design import Design
 from railnav.monitoring.fitting import judgement, precision, segmentation, stretches
 from railnav.monitoring.fitting.axis import Axis
@@ -26,7 +26,7 @@ IntArray = NDArray[np.int64]
 FLOOR = 5e-4
 FLOOR_CANT = 2e-4
 #: A law must be likelier than the clothoid by this, in -2 log likelihood, to be said; and one transition's than the track's.
-LAW_WORTH = 6.0
+LAW_WORTH = 8.0
 LAW_ALONE = 25.0
 #: A sum of squares may grow by this for each element that is left out.
 _DEARER = 9.0
@@ -34,6 +34,10 @@ _DEARER = 9.0
 _AROUND = 20.0
 #: Cubic parabolas turn by less, rad.
 _CUBIC_TURN = 0.5
+#: Transitions tell their law if they shift the curve by this many sigmas.
+_TELLING = 3.0
+#: Rounds of leaving out elements.
+_ROUNDS = 5
 _LAWS = (elements.BLOSS, elements.COSINE, elements.SINE, elements.HELMERT, elements.CUBIC)
 #: Height of the centre of gravity that a Viennese bend is made for, m.
 SWAY_HEIGHT = 1.8
@@ -163,7 +167,10 @@ def fit_design(
     fit = fit_plan(chain_of_pieces(pieces, along, ref), along, east, north, per_point)
     fit = _simplified(fit, east, north, per_point, noise)
     items = judgement.items_of(fit.chain)
-    fit = _tried(fit, judgement.smooth_joints(items), east, north, per_point, _spread(fit, noise))
+    smoother = _tried(fit, judgement.smooth_joints(items), east, north, per_point, _spread(fit, noise))
+    items = judgement.items_of(smoother.chain)
+    smoother = _tried(smoother, judgement.plain_transitions(items), east, north, per_point, _spread(fit, noise))
+    fit = fit if smoother is fit else _simplified(smoother, east, north, per_point, noise)
     tell(label, 2, total)
     fit, margin, second = _with_laws(fit, east, north, per_point, noise, laws)
     tell(label, 3, total)
@@ -249,19 +256,14 @@ def _simplified(fit: PlanFit, east: FloatArray, north: FloatArray, sigma: FloatA
     chain = judgement.chain_of(judgement.split_inflections(judgement.items_of(fit.chain)))
     if len(chain.kind) != len(fit.chain.kind):
         fit = fit_plan(chain, fit.along, east, north, sigma)
-    for _ in range(4):
+    for _ in range(_ROUNDS):
         length_sigma, bend_sigma, _ = _plan_sigmas(fit, noise)
         items = judgement.items_of(fit.chain)
-        fewer = judgement.simplify(items, bend_sigma, length_sigma)
-        if len(fewer) == len(items) and all(a.kind == b.kind for a, b in zip(fewer, items, strict=True)):
+        edits = judgement.simplifications(items, bend_sigma, length_sigma)
+        fewer = _tried(fit, edits, east, north, sigma, _spread(fit, noise))
+        if fewer is fit:
             break
-        fewer = judgement.split_inflections(fewer)
-        again = fit_plan(judgement.chain_of(fewer), fit.along, east, north, sigma)
-        left_out = len(items) - len(fewer) + sum(a.kind == elements.ARC for a in items)
-        left_out -= sum(a.kind == elements.ARC for a in fewer)
-        if again.cost > fit.cost + _DEARER * max(left_out, 1):
-            break
-        fit = again
+        fit = fewer
     return fit
 
 
@@ -280,7 +282,10 @@ def _tried(
     edges = fit.chain.edges
     low = np.array([edges[edit.first] for edit in edits]) - _AROUND
     high = np.array([edges[edit.last] for edit in edits]) + _AROUND
-    trial = fit_plan(judgement.chain_of(judgement.applied(items, edits)), fit.along, east, north, sigma)
+    try:
+        trial = fit_plan(judgement.chain_of(judgement.applied(items, edits)), fit.along, east, north, sigma)
+    except EstimationError:
+        return fit
     dearer = (judgement.squares_between(trial, low, high) - judgement.squares_between(fit, low, high)) / spread
     good = [e for e, cost in zip(edits, dearer.tolist(), strict=True) if cost < _DEARER * e.fewer]
     if len(good) == len(edits):
@@ -315,7 +320,11 @@ def _with_laws(
         if law == CLOTHOID and not edits:
             fits[law] = fit
         else:
-            fits[law] = fit_plan(trial, fit.along, east, north, sigma, steps=15)
+            try:
+                fits[law] = fit_plan(trial, fit.along, east, north, sigma, steps=15)
+            except EstimationError:  # a law under which the elements are not determined is none for these points
+                if law == CLOTHOID:
+                    fits[law] = fit
     edges = fit.chain.edges
     # stretches of transitions in the fit as found, runs as one
     first = {e.first: e for e in edits}
@@ -333,7 +342,12 @@ def _with_laws(
     high = np.array([edges[b] + max(0.5 * (edges[b] - edges[a]), _AROUND) for a, b, _ in spans])
     several = np.array([few for _, _, few in spans])
     apart = judgement.squares_between(fit, low, high) / spread + _DEARER * several
-    local = {law: judgement.squares_between(found, low, high) / spread for law, found in fits.items()}
+    # laws differ by less than a transition shifts its curve, change of curvature times length squared over 24
+    telling = np.array([_shift(items[a:b]) > _TELLING * float(sigma[0]) for a, b, _ in spans])
+    apart = np.where(telling, apart, 0.0)
+    local = {
+        law: np.where(telling, judgement.squares_between(found, low, high) / spread, 0.0) for law, found in fits.items()
+    }
     # where several clothoids are needed whatever the law, they tell nothing of it
     cost = {law: float(np.minimum(values, apart).sum()) for law, values in local.items()}
     order = sorted(cost, key=lambda law: cost[law])
@@ -347,7 +361,7 @@ def _with_laws(
             better = values < least
             law_of[better], least[better] = law, values[better]
     chosen_cost = np.choose(np.searchsorted(sorted(local), law_of), [local[law] for law in sorted(local)])
-    stay = (several > 0) & (apart < chosen_cost)
+    stay = (several > 0) & telling & (apart < chosen_cost)
     kept = [e for e, whole in zip(edits, stay[several > 0].tolist(), strict=True) if not whole]
     merged = judgement.applied(items, kept)
     # laws by element of the merged chain
@@ -364,6 +378,11 @@ def _with_laws(
         start = fits[best].chain if not stay.any() and (law_of == best).all() else judgement.chain_of(merged)
         chosen = fit_plan(judgement.with_law(start, law_by_item), fit.along, east, north, sigma)
     return chosen, float(margin), elements.KIND_NAMES[second]
+
+
+def _shift(run: list[judgement.Item]) -> float:
+    """By how much a transition shifts its curve, m."""
+    return abs(run[-1].k1 - run[0].k0) * sum(item.length for item in run) ** 2 / 24.0
 
 
 def _spread(fit: PlanFit, noise: Noise) -> float:

@@ -125,8 +125,8 @@ def split_inflections(items: list[Item]) -> list[Item]:
     return out
 
 
-def simplify(items: list[Item], bend_sigma: FloatArray, length_sigma: FloatArray) -> list[Item]:
-    """Elements without those that the points do not speak for.
+def simplifications(items: list[Item], bend_sigma: FloatArray, length_sigma: FloatArray) -> list[Edit]:
+    """Edits that leave out what the points do not speak for; none overlaps another.
 
     Parameters
     ----------
@@ -136,64 +136,78 @@ def simplify(items: list[Item], bend_sigma: FloatArray, length_sigma: FloatArray
     length_sigma : (m,) array
         m.
     """
-    work = list(items)
-    for j, item in enumerate(work):
-        if item.kind == elements.ARC and abs(item.k0) < NOTHING * bend_sigma[j]:
-            work[j] = replace(item, kind=elements.STRAIGHT, k0=0.0, k1=0.0)
-            if j > 0 and work[j - 1].kind >= elements.CLOTHOID and item.smooth:
-                work[j - 1] = replace(work[j - 1], k1=0.0)
-            if j + 1 < len(work) and work[j + 1].kind >= elements.CLOTHOID and work[j + 1].smooth:
-                work[j + 1] = replace(work[j + 1], k0=0.0)
-    sigma = list(zip(bend_sigma.tolist(), length_sigma.tolist(), strict=True))
-    changed = True
-    while changed and len(work) > 1:
-        changed = False
-        for j in range(len(work)):
-            item = work[j]
-            before = work[j - 1] if j > 0 else None
-            after = work[j + 1] if j + 1 < len(work) else None
-            if before is not None and _same(before, item, sigma[j - 1][0], sigma[j][0]):
-                work[j - 1] = replace(before, length=before.length + item.length)
-                del work[j], sigma[j]
-                changed = True
-                break
-            if item.kind >= elements.CLOTHOID and before is not None and after is not None:
-                plain = before.kind < elements.CLOTHOID and after.kind < elements.CLOTHOID
-                if plain and _same(before, after, sigma[j - 1][0], sigma[j + 1][0]):
-                    work[j - 1] = replace(before, length=before.length + item.length + after.length)
-                    del work[j : j + 2], sigma[j : j + 2]
-                    changed = True
-                    break
-                if plain and item.length < _NO_LENGTH * sigma[j][1]:
-                    half = 0.5 * item.length
-                    work[j - 1] = replace(before, length=before.length + half)
-                    work[j + 1] = replace(after, length=after.length + half, smooth=False, start=_back(after, half))
-                    del work[j], sigma[j]
-                    changed = True
-                    break
-            if item.kind >= elements.CLOTHOID and item.length < 0.5:
-                if before is not None and before.kind >= elements.CLOTHOID and item.smooth:
-                    work[j - 1] = replace(before, length=before.length + item.length, k1=item.k1)
-                    del work[j], sigma[j]
-                    changed = True
-                    break
-                if after is not None and after.kind >= elements.CLOTHOID and after.smooth:
-                    grown = replace(item, length=after.length + item.length, k1=after.k1)
-                    work[j : j + 2] = [grown]
-                    del sigma[j]
-                    changed = True
-                    break
-            short = item.length < _NO_LENGTH * sigma[j][1]
-            if item.kind < elements.CLOTHOID and short and before is not None and after is not None:
-                turning = before.kind >= elements.CLOTHOID and after.kind >= elements.CLOTHOID
-                if turning and item.smooth and after.smooth:
-                    half = 0.5 * item.length
-                    work[j - 1] = replace(before, length=before.length + half)
-                    work[j + 1] = replace(after, length=after.length + half, start=_back(after, half))
-                    del work[j], sigma[j]
-                    changed = True
-                    break
-    return work
+    edits: list[Edit] = []
+    free = 0
+    for j, item in enumerate(items):
+        before = items[j - 1] if j > 0 else None
+        after = items[j + 1] if j + 1 < len(items) else None
+        lo = j - 1 if before is not None else j
+        if lo < free:
+            continue
+        edit = _without(items, j, bend_sigma, length_sigma)
+        if edit is None and item.kind == elements.ARC and abs(item.k0) < NOTHING * bend_sigma[j]:
+            changed = [replace(item, kind=elements.STRAIGHT, k0=0.0, k1=0.0)]
+            if before is not None:
+                tied = before.kind >= elements.CLOTHOID and item.smooth
+                changed.insert(0, replace(before, k1=0.0) if tied else before)
+            if after is not None:
+                tied = after.kind >= elements.CLOTHOID and after.smooth
+                changed.append(replace(after, k0=0.0) if tied else after)
+            edit = Edit(lo, lo + len(changed), tuple(changed), 1)
+        if edit is not None and edit.first >= free:
+            edits.append(edit)
+            free = edit.last
+    return edits
+
+
+def _without(items: list[Item], j: int, bend_sigma: FloatArray, length_sigma: FloatArray) -> Edit | None:
+    """The edit that leaves out element j, or makes it one with its neighbours; None where it stands."""
+    item = items[j]
+    before = items[j - 1] if j > 0 else None
+    after = items[j + 1] if j + 1 < len(items) else None
+    if before is not None and _same(before, item, bend_sigma[j - 1], bend_sigma[j]):
+        return Edit(j - 1, j + 1, (replace(before, length=before.length + item.length),), 2)
+    none = item.length < _NO_LENGTH * length_sigma[j]
+    half = 0.5 * item.length
+    if item.kind >= elements.CLOTHOID:
+        if before is not None and after is not None and max(before.kind, after.kind) < elements.CLOTHOID:
+            if _same(before, after, bend_sigma[j - 1], bend_sigma[j + 1]):
+                length = before.length + item.length + after.length
+                return Edit(j - 1, j + 2, (replace(before, length=length),), 3)
+            if none:
+                pair = (
+                    replace(before, length=before.length + half),
+                    replace(after, length=after.length + half, smooth=False, start=_back(after, half)),
+                )
+                return Edit(j - 1, j + 2, pair, 1)
+        if item.length < 0.5 or none:
+            if before is not None and before.kind >= elements.CLOTHOID and item.smooth:
+                return Edit(j - 1, j + 1, (replace(before, length=before.length + item.length, k1=item.k1),), 2)
+            if after is not None and after.kind >= elements.CLOTHOID and after.smooth:
+                return Edit(j, j + 2, (replace(item, length=after.length + item.length, k1=after.k1),), 2)
+        return None
+    if not none or before is None or after is None:
+        return None
+    turning = before.kind >= elements.CLOTHOID, after.kind >= elements.CLOTHOID
+    if all(turning) and item.smooth and after.smooth:
+        pair = (
+            replace(before, length=before.length + half),
+            replace(after, length=after.length + half, start=_back(after, half)),
+        )
+        return Edit(j - 1, j + 2, pair, 1)
+    if turning[0] and not turning[1]:
+        pair = (
+            replace(before, length=before.length + half, k1=after.k0),
+            replace(after, length=after.length + half, smooth=True, start=_back(after, half)),
+        )
+        return Edit(j - 1, j + 2, pair, 1)
+    if turning[1] and not turning[0]:
+        pair = (
+            replace(before, length=before.length + half),
+            replace(after, length=after.length + half, k0=before.k1, smooth=True, start=_back(after, half)),
+        )
+        return Edit(j - 1, j + 2, pair, 1)
+    return None
 
 
 def _back(item: Item, by: float) -> tuple[float, float, float]:
@@ -244,6 +258,52 @@ def smooth_joints(items: list[Item]) -> list[Edit]:
         if edits and edits[-1].last > j - 1:
             continue  # one at a time where they touch
         edits.append(Edit(j - 1, j + 1, pair, 1))
+    return edits
+
+
+def plain_transitions(items: list[Item]) -> list[Edit]:
+    """Edits that make an arc of a transition whose curvatures are alike, and a straight of one that hardly bends."""
+    edits: list[Edit] = []
+    for j, item in enumerate(items):
+        if item.kind < elements.CLOTHOID:
+            continue
+        lo, hi = max(j - 1, 0), min(j + 2, len(items))
+        if edits and edits[-1].last > lo:
+            continue
+        around = items[lo:hi]
+        sharp = max(max(abs(other.k0), abs(other.k1)) for other in around)
+        alike = item.k0 * item.k1 > 0.0 and abs(item.k1 - item.k0) < 0.05 * max(abs(item.k0), abs(item.k1))
+        flat = max(abs(item.k0), abs(item.k1)) < 0.04 * sharp
+        if not (alike or flat):
+            continue
+        bend = 0.0 if flat else 0.5 * (item.k0 + item.k1)
+        out = [replace(item, kind=elements.STRAIGHT if flat else elements.ARC, k0=bend, k1=bend)]
+        before = items[j - 1] if j > 0 else None
+        after = items[j + 1] if j + 1 < len(items) else None
+        if (before is not None and before.kind < elements.CLOTHOID and item.smooth) or (
+            after is not None and after.kind < elements.CLOTHOID and after.smooth
+        ):
+            # between plain elements: one of them takes its place
+            if before is not None and before.kind == out[0].kind:
+                out = [replace(before, length=before.length + item.length)]
+                if after is not None:
+                    out.append(after)
+                    if after.kind == before.kind:
+                        out = [replace(before, length=before.length + item.length + after.length)]
+            elif after is not None and after.kind == out[0].kind:
+                out = [replace(after, length=after.length + item.length, start=item.start, smooth=item.smooth)]
+                if before is not None:
+                    tied = before.kind >= elements.CLOTHOID and item.smooth
+                    out.insert(0, replace(before, k1=after.k0) if tied else before)
+            else:
+                continue
+            edits.append(Edit(lo, hi, tuple(out), 2))
+            continue
+        if before is not None:
+            out.insert(0, replace(before, k1=bend) if before.kind >= elements.CLOTHOID else before)
+        if after is not None:
+            out.append(replace(after, k0=bend) if after.kind >= elements.CLOTHOID else after)
+        edits.append(Edit(lo, hi, tuple(out), 1))
     return edits
 
 

@@ -30,6 +30,8 @@ _MOST_STEPS = 40
 _SETTLED = 2e-4
 #: How far elements may miss each other on the way, m, rad.
 _APART, _TURNED = 0.02, 1e-3
+#: Share of what points tell that every unknown is held with.
+_TRACE = np.array([1e-10, 1e-10, 1e-10, 1e-9])
 #: No track bends more than this, 1/m.
 _SHARPEST = 0.2
 #: A length changes by no more than this share in a step.
@@ -430,7 +432,7 @@ def _damping(chain: Chain, diagonal: FloatArray) -> FloatArray:
     scale = np.zeros(len(diagonal))
     own = diagonal[: _OWN * m].reshape(m, _OWN)
     told = np.maximum(own.max(axis=0), 1e-30)
-    scale[: _OWN * m] = np.tile(np.array([0.0, 0.0, 0.0, 1e-9]) * told, m)
+    scale[: _OWN * m] = np.tile(_TRACE * told, m)
     bends = diagonal[_OWN * m :]
     if len(bends):
         scale[_OWN * m :] = 1e-12 * max(float(bends.max()), 1e-30)

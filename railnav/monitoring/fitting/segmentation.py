@@ -29,7 +29,7 @@ LEVEL, RAMP = 1, 2
 #: Price of a piece, in -2 log likelihood: what its place costs to say.
 _PRICE = 8.0
 #: Further price of a curvature that jumps, or a gradient that kinks.
-_JUMP_PRICE = 6.0
+_JUMP_PRICE = 10.0
 #: Hypotheses that cost more than the cheapest by this are given up.
 _MARGIN = 70.0
 _BEAM = 240
