@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +91,29 @@ def read_common_points(path: str | Path) -> CommonPoints:
     return CommonPoints(
         names, latitude, longitude, height, table.number["easting_m"], table.number["northing_m"], local
     )
+
+
+def read_course(path: str | Path) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Read the places of a line in order.
+
+    Parameters
+    ----------
+    path : path
+        .csv or .parquet: latitude_deg, longitude_deg and, where known, height_m.
+
+    Returns
+    -------
+    latitude, longitude, height : (n,) array
+        rad, rad, m (NaN where unknown).
+
+    Raises
+    ------
+    InputError
+        A missing file or column, or an empty cell where a place is needed.
+    """
+    table = read_table(path, [*_GEODETIC[:2], replace(_GEODETIC[2], required=False, complete=False)])
+    latitude, longitude = (freeze(np.radians(table.number[key])) for key in ("latitude_deg", "longitude_deg"))
+    return latitude, longitude, table.number.get("height_m", np.full(len(latitude), np.nan))
 
 
 def write_points(
