@@ -98,6 +98,13 @@ PAGES = {
                 real_data=True,
             ),
             Section(
+                "claims",
+                "What the inertial sources claim",
+                "Every claim of the two sources behind the inertial suite, measured again on simulated data: what the source says, what comes "
+                "out, and why where it cannot hold.",
+                "python benchmarks/claims.py",
+            ),
+            Section(
                 "outages",
                 "Real drive without a map: the loose inertial filter with RTK withheld",
                 "A car with RTK GNSS and a low-cost IMU; the fixes left out are the truth. Causal, no constraints.",
