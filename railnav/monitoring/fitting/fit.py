@@ -14,6 +14,7 @@ from railnav.monitoring.fitting import judgement, precision, segmentation, stret
 from railnav.monitoring.fitting.axis import Axis
 from railnav.monitoring.fitting.noise import Resolution, likeliest, resolution
 from railnav.monitoring.fitting.plan import Chain, PlanFit, chain_of_pieces, fit_plan
+from railnav.monitoring.fitting.rounding import round_design
 from railnav.monitoring.fitting.segmentation import Noise, Pieces
 from railnav.run import Progress
 from railnav.track import elements
@@ -108,6 +109,8 @@ def fit_design(
     sigma: float | None = None,
     sigma_height: float | None = None,
     laws: tuple[int, ...] = _LAWS,
+    rounded: bool = False,
+    on_ground: bool = False,
     progress: Progress | None = None,
 ) -> Fitted:
     """Fit straights, arcs, transitions, grades, vertical curves and cant ramps to a measured axis.
@@ -120,6 +123,10 @@ def fit_design(
         White noise of the points across the track and in height, m; by default found from the points.
     laws : tuple of int
         Laws of transitions that may be chosen besides the clothoid.
+    rounded : bool
+        Round radii and lengths of transitions to design values as far as their sigmas allow, and adjust the rest again.
+    on_ground : bool
+        Round what they are on the ground, not in the plane.
     progress : callable, optional
         As in `railnav.run.Progress`.
 
@@ -178,6 +185,11 @@ def fit_design(
         warnings.append(f"track {axis.track}: the elements did not come to rest; their sigmas may be too small")
     noise = _as_found(fit, noise, sigma)
     length_sigma, bend_sigma, station_sigma = _plan_sigmas(fit, noise)
+    if rounded:
+        with np.errstate(divide="ignore"):
+            of_radius = bend_sigma / np.where(fit.chain.kind == elements.ARC, fit.chain.k0, np.nan) ** 2
+        fit, count = round_design(fit, east, north, of_radius, length_sigma, scale=axis.scale if on_ground else 1.0)
+        warnings.append(f"track {axis.track}: {count} radii and lengths rounded; sigmas are those before")
     plan = fit.chain.plan
     k = np.where(plan.kind == elements.ARC, plan.curvature_start, np.nan)
     radius_sigma = bend_sigma / k**2

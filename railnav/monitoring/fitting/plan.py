@@ -171,7 +171,14 @@ def chain_of_pieces(pieces: Pieces, along: FloatArray, ref: tuple[FloatArray, ..
 
 
 def fit_plan(
-    chain: Chain, along: FloatArray, east: FloatArray, north: FloatArray, sigma: FloatArray, *, steps: int = _MOST_STEPS
+    chain: Chain,
+    along: FloatArray,
+    east: FloatArray,
+    north: FloatArray,
+    sigma: FloatArray,
+    *,
+    steps: int = _MOST_STEPS,
+    held: NDArray[np.bool_] | None = None,
 ) -> PlanFit:
     """Adjust all elements to points.
 
@@ -187,6 +194,8 @@ def fit_plan(
         Of the points across the track, m.
     steps : int
         At most.
+    held : (m + c,) bool array, optional
+        Lengths, then shared curvatures, that stay as they are.
 
     Raises
     ------
@@ -215,14 +224,14 @@ def fit_plan(
         state = _lay(chain, owner, s)
     damping, merit = 1e-5, _merit(chain, x, y, sigma, state)
     for count in range(steps):
-        residual, rows, kkt, rhs = _equations(chain, owner, s, x, y, sigma, robust, state, damping)
+        residual, rows, kkt, rhs = _equations(chain, owner, s, x, y, sigma, robust, state, damping, held)
         step = _solve(kkt, rhs)[: _OWN * m + len(chain.bend)]
         end = s[-1] if owner[-1] == m - 1 else None
         for _ in range(7):  # a step that leads away is taken again, shorter
             trial, moved = _stepped(chain, step, end)
             if not _lawful(trial, reach):
                 damping = max(damping * 10.0, 1e-4)
-                _, rows, kkt, rhs = _equations(chain, owner, s, x, y, sigma, robust, state, damping)
+                _, rows, kkt, rhs = _equations(chain, owner, s, x, y, sigma, robust, state, damping, held)
                 step = _solve(kkt, rhs)[: _OWN * m + len(chain.bend)]
                 trial, moved = chain, 0.0
                 trial_owner, trial_s, trial_state, trial_merit = owner, s, state, merit
@@ -236,7 +245,7 @@ def fit_plan(
                 damping = max(damping * 0.2, 1e-9)
                 break
             damping = max(damping * 10.0, 1e-4)
-            _, rows, kkt, rhs = _equations(chain, owner, s, x, y, sigma, robust, state, damping)
+            _, rows, kkt, rhs = _equations(chain, owner, s, x, y, sigma, robust, state, damping, held)
             step = _solve(kkt, rhs)[: _OWN * m + len(chain.bend)]
         gained = merit - trial_merit
         chain, owner, s, state, merit = trial, trial_owner, trial_s, trial_state, trial_merit
@@ -249,7 +258,7 @@ def fit_plan(
     for _ in range(3):
         owner, s = _feet(chain, owner, s, x, y, state)
         state = _lay(chain, owner, s)
-    residual, rows, kkt, _ = _equations(chain, owner, s, x, y, sigma, robust, state)
+    residual, rows, kkt, _ = _equations(chain, owner, s, x, y, sigma, robust, state, 0.0, held)
     cost = float(np.sum(robust * (residual / sigma) ** 2))
     along = chain.edges[owner] + s
     start = chain.start.copy()
@@ -317,6 +326,7 @@ def _equations(
     robust: FloatArray,
     state: tuple[FloatArray, ...],
     damping: float = 0.0,
+    held: NDArray[np.bool_] | None = None,
 ) -> tuple[FloatArray, object, object, FloatArray]:
     """Residuals, whitened design, and the normal equations with their conditions, eq (10)."""
     from scipy import sparse
@@ -383,11 +393,22 @@ def _equations(
     put(r0, np.array([0]), np.array([np.sin(b0)]))
     put(r0, np.array([1]), np.array([np.cos(b0)]))
     put(r0 + 1, np.array([_OWN * m - 1]), np.array([1.0]))
+    stay = np.empty(0, np.int64) if held is None else np.flatnonzero(held)
+    stay = stay[stay != m - 1]
+    put(
+        3 * (m - 1) + 2 + np.arange(len(stay)),
+        np.where(stay < m, _OWN * stay + _OWN - 1, _OWN * m + stay - m),
+        np.ones(len(stay)),
+    )
     rest = np.concatenate(
-        [miss.ravel(), [(x[0] - chain.start[0, 0]) * np.sin(b0) + (y[0] - chain.start[0, 1]) * np.cos(b0), 0.0]]
+        [
+            miss.ravel(),
+            [(x[0] - chain.start[0, 0]) * np.sin(b0) + (y[0] - chain.start[0, 1]) * np.cos(b0), 0.0],
+            np.zeros(len(stay)),
+        ]
     )
     conditions = sparse.csr_array(
-        (np.concatenate(data), (np.concatenate(rows), np.concatenate(cols))), shape=(3 * (m - 1) + 2, p)
+        (np.concatenate(data), (np.concatenate(rows), np.concatenate(cols))), shape=(3 * (m - 1) + 2 + len(stay), p)
     )
     normal = design.T @ design
     scale = _damping(chain, normal.diagonal()) + damping * normal.diagonal()
