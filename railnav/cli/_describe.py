@@ -218,6 +218,20 @@ def print_run(facts: dict[str, Any], title: str) -> None:
         ],
         left=2,
     )
+    for log in facts.get("logs", []):
+        print_facts(
+            f"Log {log['file']} ({log['format']})",
+            {
+                "fixes": f"{log['fixes']:,} from {log['good']:,} {log['unit']}",
+                "held": ", ".join(f"{count:,} {kind}" for kind, count in log["counts"].items()),
+                "broken": f"{log['broken']:,}, the first at {log['first_broken']}" if log["broken"] else "",
+                "without a fix": f"{log['void']:,} instants" if log["void"] else "",
+                "duplicates": f"{log['duplicates']:,} second fixes at one instant" if log["duplicates"] else "",
+                "notes": "; ".join(log["notes"]),
+            },
+        )
+    if facts.get("notes"):
+        print_facts("Notes", {str(i + 1): note for i, note in enumerate(facts["notes"])})
 
 
 def describe_solution(solution: Solution) -> dict[str, Any]:
@@ -226,8 +240,9 @@ def describe_solution(solution: Solution) -> dict[str, Any]:
 
     from railnav.navigation.solution import Mode
 
-    placed = solution.track >= 0
-    order = solution.track[placed]
+    # schemes without a map name no tracks
+    placed = solution.track >= 0 if solution.track_id else np.isfinite(solution.latitude)
+    order = solution.track[solution.track >= 0]
     changes = np.flatnonzero(np.diff(order, prepend=-1)) if len(order) else np.zeros(0, dtype=np.int64)
     modes = {mode.label: int(np.count_nonzero(solution.mode == mode)) for mode in Mode}
     return {

@@ -16,7 +16,12 @@ if TYPE_CHECKING:
 
 @click.command("navigate")
 @click.argument("run", type=PATH)
-@click.option("-m", "--model", type=PATH, required=True, help="Reference track model, .gpkg (or .geojson).")
+@click.option(
+    "-m",
+    "--model",
+    type=PATH,
+    help="Reference track model, .gpkg (or .geojson); needed by the schemes track and map-corrector.",
+)
 @click.option("-o", "--output", type=PATH, required=True, help="Solution to write: .csv, .parquet, .gpkg or .geojson.")
 @click.option("--smooth", is_flag=True, help="Use the whole run for every epoch (fixed-interval smoother).")
 @click.option(
@@ -26,16 +31,27 @@ if TYPE_CHECKING:
     show_default=True,
     help="Risk, per epoch, that the error exceeds the protection level.",
 )
+@click.option(
+    "--scheme",
+    type=click.Choice(["track", "map-corrector", "loose", "tight", "odometer", "decentralised"]),
+    default="track",
+    show_default=True,
+    help="How: the filter on the track; its fixed-gain substitute for small computers; or, without a map, the IMU aided by GNSS, "
+    "by pseudoranges, by GNSS and wheels, or by two filters fused.",
+)
+@click.option("--ranges", type=PATH, help="Pseudoranges for --scheme tight, .csv or .parquet.")
 @click.option("--calibration", type=PATH, help="Calibration file of the IMU, .toml, where run.toml names none.")
 @click.option("--explain", type=PATH, help="Write why tracks were chosen, .jsonl or .csv: candidates and evidence.")
 @click.option("--alternatives", is_flag=True, help="Write all candidates beside a .csv, .parquet or .geojson solution.")
 @json_option
 def command(
     run: Path,
-    model: Path,
+    model: Path | None,
     output: Path,
     smooth: bool,
     integrity_risk: float,
+    scheme: str,
+    ranges: Path | None,
     calibration: Path | None,
     explain: Path | None,
     alternatives: bool,
@@ -48,14 +64,42 @@ def command(
     A .gpkg also holds a table "alternatives": all tracks the train can be on at epochs that are not certain; beside
     other files --alternatives writes it as NAME_alternatives.csv (or .parquet).
 
+    Schemes without a map (loose, tight, odometer, decentralised) integrate the IMU; their solutions name no tracks,
+    and what they found of the sensors (biases, mounting, time offset) is in --json.
+
     \b
     Example:
       railnav navigate demo/service -m demo/line.gpkg -o solution.gpkg --smooth
     """  # noqa: D301
     from railnav.cli import _files
     from railnav.cli._describe import describe_solution, print_solution
+    from railnav.cli._schemes import check_request, navigate_scheme
     from railnav.cli._terminal import print_json, progress
 
+    only_track = {"--explain": explain is not None, "--alternatives": alternatives}
+    check_request(scheme, run=run, model=model, output=output, smooth=smooth, ranges=ranges, of_track=only_track)
+    if scheme != "track" or model is None:
+        from railnav.io.imu_calibration import calibrated_run
+        from railnav.io.run import read_run
+
+        recorded = calibrated_run(read_run(run), calibration)
+        with progress() as report:
+            solution = navigate_scheme(
+                recorded,
+                scheme,
+                model=model,
+                ranges=ranges,
+                smooth=smooth,
+                integrity_risk=integrity_risk,
+                progress=report,
+            )
+        solution.to_file(output)
+        facts = describe_solution(solution)
+        if as_json:
+            print_json({**facts, "output": output})
+        else:
+            print_solution(facts, f"{output} written")
+        return
     _files.check_output(
         output, _files.SOLUTION_ENDINGS, inputs=[model, *_files.members(run), *([calibration] if calibration else [])]
     )
