@@ -100,8 +100,8 @@ PAGES = {
             Section(
                 "claims",
                 "What the inertial sources claim",
-                "Every claim of the two sources behind the inertial suite, measured again on simulated data: what the source says, what comes "
-                "out, and why where it cannot hold.",
+                "Every claim of the two sources behind the inertial suite, measured again on simulated data: what the source says, what "
+                "comes out, and why where it cannot hold.",
                 "python benchmarks/claims.py",
             ),
             Section(

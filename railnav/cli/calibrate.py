@@ -155,13 +155,13 @@ def bench(found: PositionSet, latitude: float | None, gravity: float | None) -> 
     """Latitude, rad, and gravity, m/s2, of a bench: as named, else from the positions, else gravity from the latitude."""
     from math import radians
 
-    from railnav.geodesy.ellipsoid import WGS84
+    from railnav.inertial.mechanization import GravityField
 
     place = radians(latitude) if latitude is not None else found.latitude
     if gravity is not None:
         return place, gravity
     if latitude is not None and place is not None:
-        return place, float(WGS84.normal_gravity(place, 0.0))
+        return place, float(GravityField().vector(place, 0.0)[2])
     return place, found.gravity
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from railnav.errors import InputError, RunError
-from railnav.geodesy.ellipsoid import WGS84
+from railnav.inertial.mechanization import GravityField
 from railnav.inertial.positions import PositionLog
 from railnav.io.atomic import atomic_folder
 from railnav.io.run import CONTENTS, read_imu_table, read_run, write_run
@@ -242,12 +242,12 @@ def _known(found: PositionSet, runs: Sequence[Run], notes: _Notes | None) -> Pos
     if fixes:
         latitude = float(np.median(fixes[0].latitude))
         height = 0.0 if fixes[0].height is None else float(np.nanmedian(fixes[0].height))
-        gravity = float(WGS84.normal_gravity(latitude, height))
+        gravity = float(GravityField().vector(latitude, height)[2])
     if notes is not None:
         rate = None if notes.rate_deg_s is None else float(np.deg2rad(notes.rate_deg_s))
         if notes.latitude_deg is not None:
             latitude = float(np.deg2rad(notes.latitude_deg))
-            gravity = float(WGS84.normal_gravity(latitude, notes.height_m))
+            gravity = float(GravityField().vector(latitude, notes.height_m)[2])
         gravity = notes.gravity_m_s2 or gravity
     date = max((run.start for run in runs), default=None)
     return PositionSet(
