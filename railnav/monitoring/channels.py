@@ -55,7 +55,7 @@ class Channel:
     values : (n,) array
         NaN where there is no answer.
     sigma : float
-        Standard deviation of a value by the white noise of the samples, at most; NaN unknown.
+        Standard deviation of a value: by the white noise of the samples, at most, and for bands by the error of place as well; NaN unknown.
     source : str
         The stream, in words.
     band : Band or None
@@ -282,11 +282,20 @@ def _bands(recording: Recording, channels: dict[str, Channel], refused: dict[str
                 f"{title} {band.name}",
                 "m",
                 values,
-                math.hypot(white, _misplaced(recording, name, band)),
+                math.hypot(
+                    white, _misplaced(recording, name, band), _slope(values, recording.step) * recording.passage.sigma
+                ),
                 of.source,
                 band,
                 of.spacing,
             )
+
+
+def _slope(values: FloatArray, step: float) -> float:
+    """Root mean square slope of a channel: what an error of place along the track makes of its values."""
+    slope = np.diff(values) / step
+    known = slope[np.isfinite(slope)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else 0.0
 
 
 def _gnss_instead(recording: Recording, name: str, band: Band) -> str:

@@ -48,8 +48,8 @@ class Band:
 
     @property
     def settling(self) -> float:
-        """Length beside an end or a gap that is not evaluated, m: half the longest wavelength."""
-        return 0.5 * self.upper
+        """Length beside an end or a gap that is not evaluated, m: one and a half of the longest wave, and the error is below 1 %."""
+        return 1.5 * self.upper
 
 
 #: Wavelengths of EN 13848-1; the longest band of alignment reaches further than that of longitudinal level.
@@ -157,6 +157,8 @@ def _filtered(x: FloatArray, step: float, band: Band, integrate: int) -> FloatAr
     y = x - trend  # a straight line has no wavelength; its filtered value is zero
     if integrate == 1:  # an even slope belongs to an odd displacement
         left, right = y[pad:0:-1], y[-2 : -pad - 2 : -1]
+    elif integrate == 2:  # the curvature of an odd displacement is odd about zero
+        left, right = -y[pad:0:-1], -y[-2 : -pad - 2 : -1]
     else:
         left, right = 2.0 * y[0] - y[pad:0:-1], 2.0 * y[-1] - y[-2 : -pad - 2 : -1]
     wide = np.concatenate([left, y, right])

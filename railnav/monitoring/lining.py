@@ -366,7 +366,7 @@ def _spread(
         if not (np.isfinite(values).all() and np.isfinite(change).all()):
             continue
         for band in bands:
-            if step <= band.lower / 3.0 and len(values) * step > 3.0 * band.upper:
+            if step <= band.lower / 3.0 and len(values) * step > 4.0 * band.upper:
                 found[name, band.name] = (_sd(values, step, band), _sd(values + change, step, band))
     return found
 

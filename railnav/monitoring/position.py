@@ -179,11 +179,11 @@ def _joined(recording: Recording, position: str, angle: str) -> tuple[FloatArray
 
 
 def _slow(of: Series, step: float, wave: float) -> float:
-    """Slow errors of a receiver that no smoothing removes: taken as half of what a fix is good to; all of it on a short stretch."""
+    """Slow errors of a receiver that no smoothing removes: taken as two thirds of what a fix is good to; all of it on a short stretch."""
     known = np.isfinite(of.values)
     if known.sum() * step < 3.0 * wave:
         return of.noise
-    return 0.5 * of.noise
+    return 2.0 / 3.0 * of.noise
 
 
 def _on(values: FloatArray, recording: Recording, grid: FloatArray) -> FloatArray:

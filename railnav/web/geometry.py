@@ -456,8 +456,8 @@ def _ability_section(report: Report) -> Section:
                     merged.setdefault((name.replace("_", " "), "", reason, "no"), []).append((run, None))
     text = (
         "A band is given where its shortest wave is sampled three times, and judged where the noise is at most a third of the "
-        "mildest limit. Sigma is that of the samples' white noise, at most; long-wave distances from the model by GNSS state their "
-        "whole scatter. Sensors on a sprung body do not show the rails above some hertz."
+        "mildest limit. Sigma is that of the samples' white noise, at most, and in bands of the place; long-wave distances from the "
+        "model by GNSS state their whole scatter. Sensors on a sprung body do not show the rails above some hertz."
     )
     columns = ("channel", "runs", "from", "why not judged", "sample each, m", "sigma at most", "judged")
     rows = []

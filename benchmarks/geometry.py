@@ -1,0 +1,327 @@
+"""Track geometry: filters against sinusoids, chords, channels and detections on simulated irregular track, overlay, lining, and how fast.
+
+    python benchmarks/geometry.py [--seeds 4] [--quick] [--json PATH]
+
+Recording cars are simulated on the bundled line (or a line of 100 km) with irregularities and defects of known size; everything that has a
+truth is held against it. Real lines carry no truth and are not in here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import tempfile
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import railnav as rn
+from railnav.io.limits import default_limits
+from railnav.monitoring.channels import channels_of
+from railnav.monitoring.filters import D1, D2, D3_ALIGNMENT, D3_LEVEL, band_pass, gain
+from railnav.monitoring.limits import exceedances
+from railnav.monitoring.lining import LiningLimits, line_up
+from railnav.monitoring.overlay import overlay, shifted
+from railnav.monitoring.position import measured_axis
+from railnav.monitoring.recording import record
+from railnav.monitoring.section import onto, passages_of
+from railnav.monitoring.smoothing import whittaker
+from railnav.monitoring.trends import growth
+from railnav.monitoring.versines import Chord
+from railnav.simulation import Leg
+from railnav.simulation.irregularities import KINDS, Defect, irregular, simulate_geometry
+
+CHORDS = (
+    ("10 m", 5.0, 5.0),
+    ("20 m", 10.0, 10.0),
+    ("4.1 + 17.4 m", 4.1, 17.4),
+    ("4 + 6 m", 4.0, 6.0),
+    ("2.6 + 6 m", 2.6, 6.0),
+)
+
+
+def filters() -> float:
+    """Greatest error of the filters against analytic sinusoids, as a share of the amplitude."""
+    s = np.arange(0.0, 4000.0, 0.25)
+    worst = 0.0
+    for band in (D1, D2, D3_LEVEL, D3_ALIGNMENT):
+        for wave in np.geomspace(band.lower, band.upper, 25):
+            expected = float(gain(wave, band)) * np.sin(2 * np.pi * s / wave + 0.7)
+            for times in (0, 1, 2):
+                given = np.sin(2 * np.pi * s / wave + 0.7 + 0.5 * np.pi * times) * (2 * np.pi / wave) ** times
+                error = np.abs(band_pass(given, 0.25, band, integrate=times) - expected)
+                worst = max(worst, float(np.nanmax(error)))
+    return worst
+
+
+def chords() -> list[list[str]]:
+    """The chord table of the specification, computed."""
+    rows = []
+    for name, a, b in CHORDS:
+        chord = Chord(a, b)
+        low, high = chord.seen(D1)
+        blind = ", ".join(f"{w:.2f}" for w in chord.blind(3.0, 25.0)[::-1]) or "none"
+        at = np.abs(chord.transfer([70.0, 150.0]))
+        rows.append([name, f"{chord.factor:.2f}", f"{low:.3f} to {high:.2f}", blind, f"{at[0]:.3f}", f"{at[1]:.3f}"])
+    return rows
+
+
+def track(model: rn.TrackModel) -> tuple[str, float]:
+    """The longest track."""
+    longest = max(model.track_id, key=model.length)
+    return longest, model.length(longest)
+
+
+def drive(model: rn.TrackModel, fields: Any, seed: int, *, month: float = 0.0, name: str = "") -> tuple[rn.Run, Any]:
+    """A recording car over the longest track, and where it was."""
+    which, length = track(model)
+    start = datetime.fromtimestamp(1_770_000_000 + month * 2_629_800.0, UTC)
+    run, _ = simulate_geometry(
+        model,
+        Leg((which,), start=50.0, finish=length - 50.0),
+        fields,
+        seed=seed,
+        tunnels=False,
+        start=start,
+        run_id=name or f"run-{seed}",
+    )
+    return run, passages_of(rn.navigate(run, model, smooth=True), model)[0]
+
+
+def accuracy(model: rn.TrackModel, seeds: int) -> dict[str, list[float]]:
+    """Errors of the channels against the simulated fields, and their ratio to the stated sigma."""
+    errors: dict[str, list[tuple[float, float, float]]] = {}
+    column = {"alignment": 0, "longitudinal_level": 1, "cross_level": 2, "gauge": 3}
+    for seed in range(seeds):
+        fields = irregular(model, seed=100 + seed)
+        run, passage = drive(model, fields, seed)
+        recording = record(run, passage, against_model=True)
+        geometry = channels_of(recording)
+        where, offset = passage.section.locate(geometry.distance)
+        truth = fields.at(where, offset)
+        for key, channel in geometry.channels.items():
+            name = key.rsplit("_", 1)[0] if channel.band else key
+            if name not in column and key != "cross_level_deviation":
+                continue
+            true = truth[:, column.get(name, 2)]
+            if channel.band:
+                true = band_pass(true, recording.step, channel.band)
+            elif key == "gauge":
+                true = true + recording.gauge_nominal
+            elif key == "cross_level":
+                true = true + passage.section.at(geometry.distance).cant
+            error = channel.values - true
+            errors.setdefault(key, []).append((float(np.nanstd(error)), channel.sigma, float(np.nanstd(true))))
+    return {key: [float(np.mean([e[i] for e in rows])) for i in range(3)] for key, rows in errors.items()}
+
+
+def detection(model: rn.TrackModel, seeds: int) -> dict[str, dict[str, int]]:
+    """Simulated defects: found, missed and false, against the true channel through the same filter; 5 % about a limit is left out."""
+    table, speed = default_limits(), 120.0 / 3.6
+    keys = {"gauge": "gauge", "longitudinal_level": "longitudinal_level_d1", "alignment": "alignment_d1"}
+    counts = {key: {"beyond": 0, "found": 0, "reported": 0, "false": 0} for key in keys.values()}
+    which, length = track(model)
+    for seed in range(seeds):
+        generator = np.random.default_rng(1000 + seed)
+        places = np.arange(300.0, length - 300.0, 120.0)
+        defects = []
+        for i, place in enumerate(places):
+            kind = ("gauge", "longitudinal_level", "alignment")[i % 3]
+            size = {"gauge": 0.020, "longitudinal_level": 0.016, "alignment": 0.013}[kind] * generator.uniform(0.4, 1.6)
+            sign = 1.0 if kind == "gauge" else generator.choice([-1.0, 1.0])
+            defects.append(Defect(kind, which, float(place), float(sign * size), float(generator.uniform(4.0, 14.0))))
+        fields = irregular(model, seed=200 + seed, defects=defects)
+        run, passage = drive(model, fields, 50 + seed)
+        geometry = channels_of(record(run, passage, against_model=True))
+        found, _ = exceedances(geometry, table, speed)
+        at, offset = passage.section.locate(geometry.distance)
+        truth = fields.at(at, offset)
+        for kind, key in keys.items():
+            limit = next(x for x in table.limits if x.channel == key and x.speed[0] < speed <= x.speed[1])
+            low, high = limit.levels["alert"]
+            true = truth[:, KINDS.index(kind)]
+            if kind != "gauge":
+                true = band_pass(true, 0.25, D1)
+            mine = np.array([e.peak for e in found if e.channel == key])
+            beyond = np.flatnonzero((true > 1.05 * high) | (true < 1.05 * low))
+            groups = np.split(beyond, np.flatnonzero(np.diff(beyond) > 8) + 1) if len(beyond) else []
+            for group in groups:
+                counts[key]["beyond"] += 1
+                near = np.abs(mine - geometry.distance[group].mean()) < 0.5 * np.ptp(geometry.distance[group]) + 1.0
+                counts[key]["found"] += bool(near.any())
+            for place in mine:
+                near = np.abs(geometry.distance - place) < 1.0
+                counts[key]["reported"] += 1
+                inside = (true[near] <= 0.95 * high) & (true[near] >= 0.95 * low)
+                counts[key]["false"] += bool(inside.all())
+    return counts
+
+
+def overlays(model: rn.TrackModel, seeds: int) -> tuple[float, float]:
+    """Scatter of the shift between runs before and after the overlay, m (root mean square over windows)."""
+    before, after = [], []
+    fields = irregular(model, seed=7)
+    run, passage = drive(model, fields, 1)
+    reference = channels_of(record(run, passage, against_model=True))
+    for seed in range(seeds):
+        other, way = drive(model, fields, 20 + seed)
+        part = onto(way, passage.section)
+        assert part is not None
+        lies = overlay(channels_of(record(other, part, against_model=True)), reference)
+        again = overlay(channels_of(record(other, shifted(part, lies), against_model=True)), reference)
+        before.append(float(np.sqrt(np.mean(lies.shift**2))))
+        after.append(float(np.sqrt(np.mean(again.shift**2))))
+    return float(np.mean(before)), float(np.mean(after))
+
+
+def false_trends(count: int) -> tuple[float, float]:
+    """Share of constant values called growing, and of growing ones found, over simulated histories of five dates."""
+    generator = np.random.default_rng(3)
+    months = np.array([0.0, 3.0, 6.0, 9.0, 12.0])
+    false, found = 0, 0
+    for _ in range(count):
+        rate = np.zeros(200)
+        rate[:20] = 0.05
+        values = 1.0 + rate * months[:, None] + generator.normal(0.0, 0.1, (5, 200))
+        answer = growth(months, values).significant
+        false += int(answer[20:].sum())
+        found += int(answer[:20].sum())
+    return false / (180.0 * count), found / (20.0 * count)
+
+
+def axis_error(model: rn.TrackModel, seeds: int) -> tuple[float, float, float, float]:
+    """Measured axis of one run against the simulated one: error and stated sigma, right and up, m."""
+    rows = []
+    for seed in range(seeds):
+        fields = irregular(model, seed=300 + seed)
+        run, passage = drive(model, fields, 80 + seed)
+        axis = measured_axis(passage.section, [record(run, passage, against_model=True)])
+        where, offset = passage.section.locate(axis.distance)
+        truth = fields.at(where, offset)
+        right, up = axis.right - truth[:, 0], axis.up - truth[:, 1]
+        rows.append((np.nanmean(right**2), np.nanvar(up), axis.sigma_right, axis.sigma_up))
+    mean = np.mean(rows, axis=0)
+    return math.sqrt(mean[0]), float(mean[2]), math.sqrt(mean[1]), float(mean[3])
+
+
+def whittaker_example() -> list[list[str]]:
+    """The example of the specification: 4.1, 7.1 and 9.9 mm in D1, D2 and D3, here as waves of 10, 54 and 124 m over 3 km."""
+    rows = []
+    s = np.arange(0.0, 3000.0)
+    waves = ((4.1e-3, 10.0), (7.1e-3, 54.0), (9.9e-3, 124.0))
+    y = np.sum([math.sqrt(2.0) * sigma * np.sin(2 * np.pi * s / wave) for sigma, wave in waves], axis=0)
+    for cutoff in (100.0, 200.0):
+        x = whittaker(y, 1.0, cutoff)
+        sd = [float(1e3 * np.nanstd(band_pass(x, 1.0, band)[600:2400])) for band in (D1, D2, D3_ALIGNMENT)]
+        rows.append([f"{cutoff:.0f} m", f"{1e3 * np.abs(x - y)[600:2400].max():.0f}", *(f"{v:.2f}" for v in sd)])
+    return rows
+
+
+def long_line() -> rn.TrackModel:
+    """A line of 100 km that sways gently."""
+    s = np.arange(0.0, 100_001.0, 25.0)
+    bearing = 0.4 * np.sin(2 * np.pi * s / 9000.0)
+    east, north = (np.append(0.0, np.cumsum(25.0 * f(0.5 * (bearing[1:] + bearing[:-1])))) for f in (np.sin, np.cos))
+    metres = 111_320.0
+    points = [
+        [10.0 + e / (metres * math.cos(math.radians(50.0))), 50.0 + n / metres, 200.0]
+        for e, n in zip(east, north, strict=True)
+    ]
+    feature = {
+        "type": "Feature",
+        "properties": {"track": "long", "line": ""},
+        "geometry": {"type": "LineString", "coordinates": points},
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "long.geojson"
+        path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}), encoding="utf-8")
+        return rn.read_geojson(path)
+
+
+def speed() -> dict[str, float]:
+    """Seconds for channels of 100 km at 0.25 m, and for a lining plan of 10 km at 1 m."""
+    model = long_line()
+    fields = irregular(model, seed=1)
+    begun = time.perf_counter()
+    run, _ = simulate_geometry(model, Leg(("long",)), fields, seed=1)
+    simulated = time.perf_counter() - begun
+    begun = time.perf_counter()
+    passage = passages_of(rn.navigate(run, model, smooth=True), model)[0]
+    navigated = time.perf_counter() - begun
+    begun = time.perf_counter()
+    geometry = channels_of(record(run, passage, against_model=True))
+    channels = time.perf_counter() - begun
+    short = rn.demo_line()
+    fields = irregular(short, seed=2)
+    run, passage = drive(short, fields, 2)
+    axis = measured_axis(passage.section, [record(run, passage, against_model=True)])
+    begun = time.perf_counter()
+    plan = line_up(axis, step=1.0, limits=LiningLimits())
+    lined = time.perf_counter() - begun
+    return {
+        "kilometres": geometry.distance[-1] / 1e3,
+        "samples": float(len(run.gauge.time) if run.gauge else 0),
+        "simulate": simulated,
+        "navigate": navigated,
+        "channels": channels,
+        "lining": lined,
+        "lined_km": float(plan.distance[-1] - plan.distance[0]) / 1e3,
+    }
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--quick", action="store_true", help="two seeds, no line of 100 km")
+    parser.add_argument("--json", type=Path)
+    wanted = parser.parse_args()
+    seeds = 2 if wanted.quick else wanted.seeds
+    result: dict[str, Any] = {"filter_error": filters()}
+    print("Band-pass D1, D2, D3, also integrating once and twice, against analytic sinusoids:")
+    print(f"{100 * result['filter_error']:.2f} % of the amplitude at most, everywhere")
+    print("\nchord          versine x R, m^2   |H| in D1      zeros, m               at 70 m   at 150 m")
+    for row in chords():
+        print(f"{row[0]:<15}{row[1]:>8}           {row[2]:<15}{row[3]:<22}{row[4]:>8}{row[5]:>10}")
+    print("\nWhittaker, waves of 10, 54 and 124 m with 4.1, 7.1 and 9.9 mm")
+    print("cut-off   max shift, mm    D1      D2      D3, mm")
+    for row in whittaker_example():
+        print(f"{row[0]:<10}{row[1]:>10}{row[2]:>11}{row[3]:>8}{row[4]:>8}")
+    model = rn.demo_line()
+    print(f"\nChannels, {seeds} simulated runs, {track(model)[1] / 1e3:.1f} km each (mm)")
+    print("channel                    error   stated sigma   the track itself")
+    result["channels"] = accuracy(model, seeds)
+    for key, (error, sigma, size) in result["channels"].items():
+        print(f"{key.replace('_', ' '):<26}{1e3 * error:>6.3f}{1e3 * sigma:>12.3f}{1e3 * size:>15.2f}")
+    result["detection"] = detection(model, seeds)
+    print("\nSimulated defects held against the alert limit at 120 km/h (5 % about it left out)")
+    print("channel                  beyond    found   reported   false")
+    for key, c in result["detection"].items():
+        print(f"{key.replace('_', ' '):<24}{c['beyond']:>7}{c['found']:>9}{c['reported']:>11}{c['false']:>8}")
+    result["overlay"] = overlays(model, seeds)
+    apart, laid = (100 * v for v in result["overlay"])
+    print(f"\nRuns over each other: {apart:.1f} cm apart as navigated, {laid:.1f} cm once overlaid (RMS)")
+    result["trends"] = false_trends(50 if wanted.quick else 200)
+    false, found = (100 * v for v in result["trends"])
+    print(
+        f"Growth: {false:.2f} % of constant segments called growing, {found:.0f} % of those that grow by half a sigma a month found"
+    )
+    result["axis"] = axis_error(model, seeds)
+    a, sa, u, su = (1e3 * v for v in result["axis"])
+    print(f"Measured axis of one run: {a:.1f} mm across (stated {sa:.1f}), {u:.1f} mm in height (stated {su:.1f})")
+    if not wanted.quick:
+        result["speed"] = s = speed()
+        print(
+            f"\n{s['kilometres']:.0f} km at 0.25 m: channels in {s['channels']:.1f} s (navigation before it {s['navigate']:.1f} s); "
+            f"lining of {s['lined_km']:.1f} km at 1 m in {s['lining']:.1f} s"
+        )
+    if wanted.json:
+        wanted.json.write_text(json.dumps(result, indent=2), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
