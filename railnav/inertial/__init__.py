@@ -22,7 +22,7 @@ from railnav.inertial.aided import (
     without_lever_arm,
 )
 from railnav.inertial.alignment import Alignment, coarse_align, level, lever_arm_motion
-from railnav.inertial.allan import AllanCurve, NoiseParameters, allan_deviation, fit_allan
+from railnav.inertial.allan import AllanCurve, NoiseParameters, UnitNoise, allan_deviation, fit_allan, unit_noise
 from railnav.inertial.autonomous import (
     FixedLatitude,
     averaging_time,
@@ -34,6 +34,7 @@ from railnav.inertial.autonomous import (
 )
 from railnav.inertial.calibration import TriadCalibration, multi_position, six_position, vector_calibration
 from railnav.inertial.compass import compass_heading, gyrocompass, gyrocompass_error
+from railnav.inertial.denoising import Denoised, denoise
 from railnav.inertial.diagnosis import (
     CAUSES,
     Diagnosis,
@@ -58,8 +59,12 @@ from railnav.inertial.great_circle import (
     ground_speed,
     ground_speed_error,
 )
+from railnav.inertial.growth import LegError, leg_error
 from railnav.inertial.heading import VelocityHeading, heading_from_antennas, heading_from_velocity
+from railnav.inertial.imu_calibration import ImuCalibration, Provenance, TriadNoise, TriadTemperature, apply_calibration
+from railnav.inertial.imu_diagnosis import ImuDiagnosis, diagnose_imu
 from railnav.inertial.inspection import Finding, inspect_log
+from railnav.inertial.journey import Journey, autonomous_journey
 from railnav.inertial.loose import ImuNoise, InitialSigma, LooseSolution, integrate_gnss
 from railnav.inertial.mechanization import (
     EARTH_RATE,
@@ -69,10 +74,12 @@ from railnav.inertial.mechanization import (
     mechanize,
 )
 from railnav.inertial.moving_base import MovingPosition, moving_position
-from railnav.inertial.positions import Position, position_mean
+from railnav.inertial.positions import Position, PositionLog, cut_positions, position_mean
+from railnav.inertial.procedure import METHODS, CalibrationResult, calibrate_imu
 from railnav.inertial.reference_azimuth import ReferenceLongitude, longitude_from_reference
-from railnav.inertial.resting import Rest, rest
+from railnav.inertial.resting import Rest, Stretch, find_stretches, rest
 from railnav.inertial.sensors import GRADES, SensorGrade, TriadModel, TriadSamples, misalignment_matrix, simulate_triad
+from railnav.inertial.standing import Standing, align_standing, body_axes
 from railnav.inertial.temperature import TemperaturePolynomial, fit_temperature
 from railnav.inertial.turns import Solvability, advise_turns, finite_rotation, solvability, turned_force, turned_rate
 
@@ -80,9 +87,12 @@ __all__ = [
     "CAUSES",
     "EARTH_RATE",
     "GRADES",
+    "METHODS",
     "AidedSolution",
     "Alignment",
     "AllanCurve",
+    "CalibrationResult",
+    "Denoised",
     "Diagnosis",
     "ErrorState",
     "Finding",
@@ -90,13 +100,19 @@ __all__ = [
     "FixedLatitude",
     "Fixes",
     "GravityField",
+    "ImuCalibration",
+    "ImuDiagnosis",
     "ImuNoise",
     "InitialSigma",
+    "Journey",
+    "LegError",
     "LooseSolution",
     "MovingPosition",
     "NavigationState",
     "NoiseParameters",
     "Position",
+    "PositionLog",
+    "Provenance",
     "Ranges",
     "ReferenceLongitude",
     "Rest",
@@ -104,27 +120,41 @@ __all__ = [
     "ScalarControl",
     "SensorGrade",
     "Solvability",
+    "Standing",
+    "Stretch",
     "TemperaturePolynomial",
     "Trajectory",
     "TriadCalibration",
     "TriadModel",
+    "TriadNoise",
     "TriadSamples",
+    "TriadTemperature",
+    "UnitNoise",
     "Unknowns",
     "Vehicle",
     "VehicleMotion",
     "VelocityHeading",
     "advise_positions",
     "advise_turns",
+    "align_standing",
     "allan_deviation",
+    "apply_calibration",
+    "autonomous_journey",
     "averaging_time",
+    "body_axes",
+    "calibrate_imu",
     "coarse_align",
     "compass_heading",
     "coning_rate",
+    "cut_positions",
+    "denoise",
     "diagnose",
+    "diagnose_imu",
     "error_dynamics",
     "error_transition",
     "feed_back",
     "find_rests",
+    "find_stretches",
     "fine_align",
     "finite_rotation",
     "fit_allan",
@@ -144,6 +174,7 @@ __all__ = [
     "inspect_log",
     "integrate",
     "integrate_gnss",
+    "leg_error",
     "level",
     "lever_arm_motion",
     "longitude_from_reference",
@@ -162,6 +193,7 @@ __all__ = [
     "solvability",
     "turned_force",
     "turned_rate",
+    "unit_noise",
     "vector_calibration",
     "vehicle_design",
     "without_lever_arm",
