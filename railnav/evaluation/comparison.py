@@ -209,6 +209,9 @@ def compare(
 
     Notes
     -----
+    A solution that names no tracks at all (of a scheme without a map) has errors along and across the true heading, and no track that
+    could be wrong.
+
     Where the solution is on a track that the train does not visit within two minutes, the error along is the offset between the
     positions projected on the true heading.
     """
@@ -232,7 +235,10 @@ def compare(
     index = np.array([names.get(name, -1) for name in solution.track_id] + [-1], np.int64)
     track = np.where(solution.track[row] >= 0, index[solution.track[row]], -1)
     used = {solution.track_id[t] for t in np.unique(solution.track[row]) if t >= 0}
-    by_name = by == "name" or (by == "auto" and bool(used & set(truth.track_id) or not used))
+    free = not used and bool(
+        np.isfinite(solution.latitude[row]).any()
+    )  # of a scheme without a map: places, but no tracks
+    by_name = not free and (by == "name" or (by == "auto" and bool(used & set(truth.track_id) or not used)))
 
     north = (solution.latitude[row] - here.latitude) * (WGS84.meridian_radius(here.latitude) + here.height)
     east = (
@@ -243,6 +249,8 @@ def compare(
     ahead = north * np.cos(here.heading) + east * np.sin(here.heading)
     across = east * np.cos(here.heading) - north * np.sin(here.heading)
     positioned = (solution.track[row] >= 0) & np.isfinite(solution.offset[row])
+    if free:
+        positioned = np.isfinite(solution.latitude[row]) & np.isfinite(solution.longitude[row])
     apart = np.hypot(north, east)[positioned]
     if len(apart) and apart.min() > ANOTHER_RUN:
         raise InputError(
@@ -258,7 +266,7 @@ def compare(
         joint = positioned & ~same & on_path & (np.abs(measured) <= joint_within)
         right = same | joint
     else:
-        right = positioned & (np.abs(across) <= track_within)
+        right = positioned if free else positioned & (np.abs(across) <= track_within)
         joint = np.zeros(len(row), bool)
     return Comparison(
         row=row,

@@ -368,6 +368,7 @@ def evaluate(
     mode = solution.mode[c.row]
     positioned = np.isfinite(c.along)
     sigma, level = solution.sigma_along[c.row], solution.protection_level_along[c.row]
+    told = positioned & (solution.track[c.row] >= 0)
     judged = positioned & c.right & np.isfinite(sigma) & (sigma > 0.0)
     return Evaluation(
         run_id=solution.run_id,
@@ -383,7 +384,7 @@ def evaluate(
         },
         modes={m.label: int((mode == m).sum()) for m in Mode if (mode == m).any()},
         selection=_selection(solution, truth, c, mode, positioned),
-        reliability=reliability(solution.track_probability[c.row][positioned], c.right[positioned]),
+        reliability=reliability(solution.track_probability[c.row][told], c.right[told]),
         consistency=consistency(c.along[judged], sigma[judged], c.time[judged], confidence=confidence),
         integrity=_integrity(c.along, level, alert_limit, solution.integrity_risk),
         coasting=_coasting(c, mode, sigma, level),
@@ -408,6 +409,7 @@ def _stretches(flag: BoolArray) -> list[tuple[int, int]]:
 def _selection(
     solution: Solution, truth: Truth, c: Comparison, mode: NDArray[np.int64], positioned: BoolArray
 ) -> TrackSelection:
+    positioned = positioned & (solution.track[c.row] >= 0)  # a scheme without a map chooses none
     tracking = positioned & (mode == Mode.TRACKING)
     wrong = positioned & ~c.right
     probability = solution.track_probability[c.row]
