@@ -436,7 +436,7 @@ def _assembled(
         **model.provenance,
         "updates": [*model.provenance.get("updates", []), entry],
     }
-    return _replaced(model, tables, provenance, new_records)
+    return with_tables(model, tables, provenance, new_records)
 
 
 def _line(old: TrackRecords) -> Any:
@@ -539,8 +539,8 @@ def _cant(model: TrackModel, name: str, side: Side | None, old: int, nodes: int)
     return np.asarray((old * stored + many * new) / (old + many))
 
 
-def _replaced(
-    model: TrackModel, tables: dict[str, KnotTable], provenance: dict[str, Any], records: ModelRecords
+def with_tables(
+    model: TrackModel, tables: dict[str, KnotTable], provenance: dict[str, Any], records: ModelRecords | None
 ) -> TrackModel:
     """The model with some of its tracks tabulated anew; mile posts and nodes go with them."""
     from railnav.track.model import KNOT_COLUMNS, MilePosts
@@ -580,7 +580,7 @@ def _replaced(
         ),
         mileposts=MilePosts(model.mileposts.track, posts, model.mileposts.chainage),
         provenance=provenance,
-        record_source=lambda: records,
+        record_source=None if records is None else lambda: records,
     )
 
 
