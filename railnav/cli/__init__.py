@@ -45,6 +45,10 @@ VERBS: dict[str, tuple[str, str]] = {
     "validate": ("validate", "Check a model or a run and report every defect at once."),
     "datum": ("datum", "List datums, compare and pin their transformations, and fit one to common points."),
     "corridor": ("corridor", "Fit a low-distortion plane to a whole line, and write it as a frame file."),
+    "chainage": (
+        "chainage",
+        "Turn published addresses into places on tracks and back, and list the kilometres of lines.",
+    ),
     "convert": ("convert", "Write a model, a solution, a run or a log in another format."),
     "view": ("view", "Draw a model or a solution as a picture or a page."),
 }

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from railnav.errors import InputError, ModelError, RailnavError
 from railnav.geodesy.grid import GridFrame
 from railnav.io.container import Container, Reader, bounds_of, create, decode_point, line_blob, opened, point_blobs
+from railnav.io.line_references import read_references, write_references
 from railnav.io.qgis_styles import add_styles
 from railnav.track.model import KNOT_COLUMNS, End, MilePosts, NodeKind, Nodes, TrackModel
 from railnav.track.records import ROW_SIZE, AxisRecords, Borders, ModelRecords, RecordSource, TrackRecords
@@ -89,6 +90,7 @@ def write_model(model: TrackModel, path: str | Path) -> None:
             _write_tracks(container, model)
             _write_nodes(container, model)
             _write_mileposts(container, model)
+            write_references(container, model.references, model.track_id)
             _write_movements(container, model)
             _write_knots(container, model)
             add_styles(container, ("tracks", "nodes", "mileposts"))
@@ -152,6 +154,7 @@ def read_model(path: str | Path) -> TrackModel:
                 nodes=nodes,
                 movements=_read_movements(reader, tracks["track_id"]),
                 mileposts=_read_mileposts(reader, tracks["track_id"]),
+                references=read_references(reader, tracks["track_id"]),
                 provenance=provenance,
                 record_source=_record_source(reader, path),
             )

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from railnav.errors import TrackError
 from railnav.geodesy.grid import GridFrame
+from railnav.track.chainage import LineReferences
 from railnav.track.index import SpatialIndex, index_tracks
 from railnav.units import wrap_angle
 
@@ -166,6 +167,8 @@ class TrackModel:
     mileposts : MilePosts
     provenance : dict
         Where the model came from: JSON values only.
+    references : LineReferences
+        Kilometres of the lines and the tracks they run over (see `railnav.track.chainage`); may be empty.
     record_source : callable or None
         Gives the square-root records of the surveys behind the model (`records`); None where it has none.
     """
@@ -191,6 +194,7 @@ class TrackModel:
     movements: IntArray
     mileposts: MilePosts
     provenance: dict[str, Any] = field(default_factory=dict)
+    references: LineReferences = field(default_factory=LineReferences)
     record_source: RecordSource | None = field(default=None, repr=False)
     _index: SpatialIndex = field(init=False, repr=False)
 
@@ -227,6 +231,8 @@ class TrackModel:
             len(self.movements) and (self.movements.min() < 0 or self.movements[:, [0, 2]].max() >= tracks)
         ):
             raise TrackError("movements name a track that the model does not have")
+        if len(self.references.track) and self.references.track.max() >= tracks:
+            raise TrackError("a line reference names a track that the model does not have")
         for array in (
             self.start_node,
             self.end_node,
