@@ -197,7 +197,7 @@ def channels_of(recording: Recording, *, bases: Sequence[float] = TWIST_BASES) -
         values = low_pass(bearing.values, step, 25.0)
         curvature = np.gradient(values, step)
         if recording.against_model:
-            curvature = curvature + recording.passage.section.at(recording.distance).curvature
+            curvature = curvature + recording.points.curvature
         noise = bearing.noise * math.sqrt(2.0 * bearing.spacing / 25.0) * 2.0 * math.pi / 25.0
         add("curvature", "Curvature, waves over 25 m", "1/m", curvature, noise, bearing)
     else:
@@ -218,7 +218,7 @@ def _cross_level(
         "cross_level", "Cross level", "m", of.values, of.noise, of.source, None, of.spacing
     )
     if recording.against_model:
-        cant = recording.passage.section.at(recording.distance).cant
+        cant = recording.points.cant
         channels["cross_level_deviation"] = Channel(
             "cross_level_deviation",
             "Cross level minus the model's cant",
@@ -313,7 +313,7 @@ def _misplaced(recording: Recording, name: str, band: Band) -> float:
     """What an error of place along the track leaves in a band when the model's shape is taken off: its bearing there, times the error."""
     if not recording.against_model:
         return 0.0
-    point = recording.passage.section.at(recording.distance)
+    point = recording.points
     bend = point.curvature if name == "alignment" else np.gradient(np.arctan(point.gradient), recording.step)
     shape = band_pass(np.where(np.isfinite(bend), bend, 0.0), recording.step, band, integrate=1)
     known = shape[np.isfinite(shape)]

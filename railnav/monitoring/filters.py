@@ -186,14 +186,21 @@ def low_pass(values: ArrayLike, step: float, wavelength: float) -> FloatArray:
     -------
     (n,) array
     """
-    from scipy.ndimage import gaussian_filter1d
-
     x = np.asarray(values, float)
     sigma = math.sqrt(2.0 * math.log(2.0)) * wavelength / (2.0 * math.pi) / step
     known = np.isfinite(x)
-    mass = gaussian_filter1d(known.astype(float), sigma, mode="constant")
-    total = gaussian_filter1d(np.where(known, x, 0.0), sigma, mode="constant")
+    mass = _gaussian(known.astype(float), sigma)
+    total = _gaussian(np.where(known, x, 0.0), sigma)
     return np.where(mass > 0.25, total / np.maximum(mass, 1e-12), np.nan)
+
+
+def _gaussian(values: FloatArray, sigma: float) -> FloatArray:
+    """Gaussian weights out to four sigma, zero beyond the ends."""
+    from scipy.signal import oaconvolve
+
+    reach = max(1, math.ceil(4.0 * sigma))
+    weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    return np.asarray(oaconvolve(values, weight / weight.sum(), mode="full")[reach : reach + len(values)])
 
 
 def stretches(there: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -212,7 +212,7 @@ def exceedances(geometry: Geometry, table: LimitTable, speed: float) -> tuple[li
     """
     found: list[Exceedance] = []
     verdicts: list[Verdict] = []
-    radius = 1.0 / np.maximum(np.abs(geometry.recording.passage.section.at(geometry.distance).curvature), 1e-9)
+    radius = 1.0 / np.maximum(np.abs(geometry.recording.points.curvature), 1e-9)
     named = {limit.channel for limit in table.limits}
     for key in (*geometry.channels, *sorted(named - set(geometry.channels))):
         channel = geometry.channels.get(key)

@@ -15,6 +15,7 @@ from railnav.attitude import dcm_from_euler, euler_rates
 from railnav.monitoring.filters import noise_floor, resample, spikes
 from railnav.monitoring.section import Passage
 from railnav.run import GaugeStream, GnssStream, GyroAnglesStream, ImuStream, Run
+from railnav.track.model import TrackPoints
 from railnav.units import RAIL_CENTRE_DISTANCE, cant_angle, wrap_angle
 
 FloatArray = NDArray[np.float64]
@@ -75,6 +76,8 @@ class Recording:
     series : dict of str to Series
         Keys: gauge, cross_level (m); bearing, slope (rad, minus the model's where `against_model`); curvature, pitch_rate (1/m, minus the
         model's where `against_model`); plan_gnss, height_gnss (m, minus the model's).
+    points : TrackPoints
+        The model's geometry at the grid, along the section.
     against_model : bool
         Whether the model's geometry was taken off bearings, slopes and curvatures: right where it is a design or exact; a model built
         from surveys of centimetres or decimetres would add its own noise to short waves.
@@ -91,6 +94,7 @@ class Recording:
     time: FloatArray
     speed: FloatArray
     series: dict[str, Series]
+    points: TrackPoints
     against_model: bool
     gauge_nominal: float = math.nan
     notes: tuple[str, ...] = field(default_factory=tuple)
@@ -152,7 +156,8 @@ def record(
         _imu(run.imu, passage, grid, against_model, series, notes)
     if run.gnss is not None and len(run.gnss):
         _gnss(run.gnss, passage, grid, series, notes)
-    return Recording(run, passage, step, grid, time, speed, series, against_model, nominal, tuple(notes))
+    points = passage.section.at(grid)
+    return Recording(run, passage, step, grid, time, speed, series, points, against_model, nominal, tuple(notes))
 
 
 def inertial_curvature(rate: FloatArray, speed: FloatArray, *, slowest: float = SLOWEST) -> FloatArray:
