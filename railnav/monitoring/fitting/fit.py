@@ -180,6 +180,9 @@ def fit_design(
     fit = fit if smoother is fit else _simplified(smoother, east, north, per_point, noise)
     tell(label, 2, total)
     fit, margin, second = _with_laws(fit, east, north, per_point, noise, laws)
+    parted = judgement.split_inflections(judgement.items_of(fit.chain))
+    if len(parted) != len(fit.chain.kind) or any(a.k0 * a.k1 < 0.0 for a in judgement.items_of(fit.chain)):
+        fit = fit_plan(judgement.chain_of(parted), fit.along, east, north, per_point)
     tell(label, 3, total)
     if not fit.settled:
         warnings.append(f"track {axis.track}: the elements did not come to rest; their sigmas may be too small")
@@ -239,7 +242,8 @@ def _resolution_of(axis: Axis, sigma: float | None) -> Resolution:
             found.append(np.diff(e, 4) * np.cos(bearing) - np.diff(n, 4) * np.sin(bearing))
         return np.concatenate(found) if found else np.empty(0)
 
-    chosen = resolution(across, spacing, len(axis.along), floor=FLOOR)
+    stated = None if axis.stated is None else float(np.median(axis.stated[:, 0]))
+    chosen = resolution(across, spacing, len(axis.along), floor=FLOOR, stated=stated)
     return chosen if sigma is None else replace(chosen, sigma=sigma)
 
 
@@ -448,14 +452,14 @@ def _plan_sigmas(fit: PlanFit, noise: Noise) -> tuple[FloatArray, FloatArray, Fl
 # --- profile and cant -------------------------------------------------------------------------------------------------
 
 
-def _values_resolution(values: FloatArray, along: FloatArray, floor: float) -> Resolution:
+def _values_resolution(values: FloatArray, along: FloatArray, floor: float, stated: float | None = None) -> Resolution:
     spacing = float(along[-1] - along[0]) / (len(along) - 1)
 
     def fourth(every: int) -> FloatArray:
         found = [np.diff(values[k::every], 4) for k in range(every)]
         return np.concatenate(found)
 
-    return resolution(fourth, spacing, len(along), floor=floor)
+    return resolution(fourth, spacing, len(along), floor=floor, stated=stated)
 
 
 def _profile(
@@ -465,7 +469,8 @@ def _profile(
         warnings.append(f"track {axis.track} has no heights: no profile")
         return None, None, None, None
     along, height = fit.along, axis.height[rows]
-    chosen = _values_resolution(height, along, FLOOR)
+    stated = None if axis.stated is None else float(np.median(axis.stated[:, 1]))
+    chosen = _values_resolution(height, along, FLOOR, stated)
     pick = np.arange(0, len(along), chosen.every)
     along, height = along[pick], height[pick]
     white = chosen.sigma if sigma is None else sigma

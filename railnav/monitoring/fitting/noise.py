@@ -22,6 +22,8 @@ IntArray = NDArray[np.int64]
 _FOURTH = 70.0
 #: Differences of smooth points grow sixteenfold as the spacing doubles, those of white noise not; points are thinned above this.
 _STILL_SMOOTH = 2.5
+#: Smoothed points are taken so far apart that they differ by this share of their stated sigma.
+_SHARE = 0.25
 #: Samples on which the waves of the noise are judged.
 _JUDGED = 1200
 #: Steps of the search for waves, in logarithms, and how many noises are tried.
@@ -57,7 +59,9 @@ def fourth_difference_sigma(values: FloatArray, every: int = 1) -> float:
     return float(np.median(np.abs(joined)) / 0.6745 / np.sqrt(_FOURTH))
 
 
-def resolution(across: Callable[[int], FloatArray], spacing: float, count: int, *, floor: float) -> Resolution:
+def resolution(
+    across: Callable[[int], FloatArray], spacing: float, count: int, *, floor: float, stated: float | None = None
+) -> Resolution:
     """Find how far apart points are worth taking, and their white noise there.
 
     Parameters
@@ -70,6 +74,8 @@ def resolution(across: Callable[[int], FloatArray], spacing: float, count: int, 
         How many there are.
     floor : float
         Noise below which points count as exact, m.
+    stated : float, optional
+        Sigma that smoothed points state, m: they are thinned until they differ by a share of it.
     """
     sizes = {}
 
@@ -81,10 +87,10 @@ def resolution(across: Callable[[int], FloatArray], spacing: float, count: int, 
 
     every = 1
     while (
-        2 * every * 40 < count
+        2 * every * 24 < count
         and 2 * every * spacing <= 200.0
-        and sigma(2 * every) > _STILL_SMOOTH * sigma(every)
-        and sigma(2 * every) > floor
+        and (sigma(2 * every) > _STILL_SMOOTH * sigma(every) or (stated is not None and sigma(every) < 0.1 * floor))
+        and (sigma(2 * every) > floor if stated is None else sigma(every) < _SHARE * stated)
     ):
         every *= 2
     return Resolution(every, every * spacing, max(sigma(every), floor))

@@ -8,6 +8,7 @@ axis from their feet, which move with it; gross errors weigh less. Lengths are t
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -224,15 +225,15 @@ def fit_plan(
         state = _lay(chain, owner, s)
     damping, merit = 1e-5, _merit(chain, x, y, sigma, state)
     for count in range(steps):
-        residual, rows, kkt, rhs = _equations(chain, owner, s, x, y, sigma, robust, state, damping, held)
-        step = _solve(kkt, rhs)[: _OWN * m + len(chain.bend)]
+        given = (chain, owner, s, x, y, sigma, robust, state)
+        count_of = _OWN * m + len(chain.bend)
+        step, damping = _step_of(given, held, damping, count_of)
         end = s[-1] if owner[-1] == m - 1 else None
         for _ in range(7):  # a step that leads away is taken again, shorter
             trial, moved = _stepped(chain, step, end)
             if not _lawful(trial, reach):
                 damping = max(damping * 10.0, 1e-4)
-                _, rows, kkt, rhs = _equations(chain, owner, s, x, y, sigma, robust, state, damping, held)
-                step = _solve(kkt, rhs)[: _OWN * m + len(chain.bend)]
+                step, damping = _step_of(given, held, damping, count_of)
                 trial, moved = chain, 0.0
                 trial_owner, trial_s, trial_state, trial_merit = owner, s, state, merit
                 continue
@@ -245,8 +246,7 @@ def fit_plan(
                 damping = max(damping * 0.2, 1e-9)
                 break
             damping = max(damping * 10.0, 1e-4)
-            _, rows, kkt, rhs = _equations(chain, owner, s, x, y, sigma, robust, state, damping, held)
-            step = _solve(kkt, rhs)[: _OWN * m + len(chain.bend)]
+            step, damping = _step_of(given, held, damping, count_of)
         gained = merit - trial_merit
         chain, owner, s, state, merit = trial, trial_owner, trial_s, trial_state, trial_merit
         residual = _across(x, y, state)
@@ -469,6 +469,19 @@ def _factor(kkt: object) -> object:
         raise EstimationError(
             "the elements are not determined by the points; fewer elements, or points further along, would do"
         ) from error
+
+
+def _step_of(
+    given: tuple[Any, ...], held: NDArray[np.bool_] | None, damping: float, count: int
+) -> tuple[FloatArray, float]:
+    """Unknowns' step (count,) and the damping it took: equations without a solution are damped until they have one."""
+    for _ in range(6):
+        _, _, kkt, rhs = _equations(*given, damping=damping, held=held)
+        try:
+            return _solve(kkt, rhs)[:count], damping
+        except EstimationError:
+            damping = max(damping * 100.0, 1e-6)
+    raise EstimationError("the elements are not determined by the points; fewer elements would do")
 
 
 def _solve(kkt: object, rhs: FloatArray) -> FloatArray:
