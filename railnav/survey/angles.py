@@ -31,12 +31,12 @@ FIRST_ERROR = 0.05
 LARGEST_SLOPE = 1.0
 #: Seconds over which the odometer is held to the fixes.
 HELD = 20.0
-#: Lags, in nodes, over which angles are compared.
-LAGS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
+#: Nodes in the blocks whose means are compared, one with the next.
+BLOCKS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 #: Of node means no more than this is believed: what changes within a node is not white, rad.
 FLOOR = 2e-5
-#: Least random walk, rad per sqrt(s).
-LEAST_WALK = 1e-7
+#: Least random walk, rad per sqrt(s): 0.007 degrees per root hour; no survey car's gyros are believed to be better.
+LEAST_WALK = 2e-6
 #: A gap in the angles longer than this is not interpolated, s.
 LONGEST_GAP = 2.0
 
@@ -120,7 +120,10 @@ def lay_angles(track: Surveyed, *, up: bool = False) -> tuple[FloatArray, FloatA
 
 
 def angle_error(value: FloatArray, time: FloatArray, axis: FloatArray | None) -> AngleError:
-    """White part and random walk of the angles of a track's runs, from how their differences grow with the lag.
+    """White part and random walk of the angles of a track's runs, from the Allan variances of their differences.
+
+    Of a difference of two runs, in which the track cancels, adjacent means of B nodes, tau seconds long, differ with the variance
+    4 v / B + 4/3 q^2 tau (v white, of one run; q^2 of its random walk); of one run less the axis with half of that.
 
     Parameters
     ----------
@@ -138,19 +141,21 @@ def angle_error(value: FloatArray, time: FloatArray, axis: FloatArray | None) ->
         pairs = [(value[i] - line, time[i], 1.0) for i in has]
     rows, power, weight = [], [], []
     for D, t, runs in pairs:
-        for lag in LAGS:
-            if lag >= len(D) // 2:
+        at = np.flatnonzero(np.isfinite(D))
+        total = np.append(0.0, np.cumsum(D[at]))
+        for block in BLOCKS:
+            if 4 * block > len(at):
                 break
-            step = D[lag:] - D[:-lag]
-            known = np.isfinite(step)
-            many = int(np.count_nonzero(known))
-            if many < 8:
+            mean = (total[block:] - total[:-block]) / block
+            step = mean[block:] - mean[:-block]
+            whole = at[2 * block - 1 :] - at[: len(step)] <= 2.2 * block  # not across gaps
+            if np.count_nonzero(whole) < 8:
                 continue
-            spread = (1.4826 * float(np.median(np.abs(step[known])))) ** 2
-            tau = float(np.median(np.abs(t[lag:] - t[:-lag])[known]))
-            rows.append([2.0 * runs, runs * tau])
+            spread = (1.4826 * float(np.median(np.abs(step[whole])))) ** 2
+            tau = float(np.median(np.abs(t[at[block:]] - t[at[:-block]])))
+            rows.append([2.0 * runs / block, 2.0 / 3.0 * runs * tau])
             power.append(spread)
-            weight.append(np.sqrt(many / lag) / max(spread, 1e-16))
+            weight.append(np.sqrt(len(at) / block) / max(spread, 1e-16))
     if len(rows) < 2:
         return AngleError(1e-3, 1e-5)
     w = np.array(weight)

@@ -47,6 +47,8 @@ LINE_REACH = 150.0
 FIRST_SPREAD = 20.0
 #: Estimations; the first `RELAID` of them each give a new nominal curve.
 ROUNDS, RELAID = 4, 2
+#: With angles in a gap the nominal curve is laid anew until it moves by less than this, m, at most so many times.
+SETTLED, MOST_RELAID = 0.1, 8
 #: How far the first guess of an axis may be off, m: no verdict on runs within that.
 FIRST_SLACK = 1.0
 #: Runs farther apart than this, degrees of latitude or longitude, are not of one survey.
@@ -272,8 +274,9 @@ def _estimated(
 ) -> tuple[list[Surveyed], Offsets]:
     """Estimate axes and frame offsets together, weights from the round before."""
     scale = np.array([0.5 * survey.models[name].correlated for name in survey.receiver_names])
-    for turn in range(ROUNDS):
-        tell("estimate", turn, ROUNDS)
+    turn, left = 0, ROUNDS - RELAID
+    while left:
+        tell("estimate", min(turn, ROUNDS - 1), ROUNDS)
         slack = FIRST_SLACK if turn == 0 else 0.0
         chains = []
         for t in tracks:
@@ -291,7 +294,11 @@ def _estimated(
             )
             t.axis = t.estimate.state[:, 0]
             t.noise = surveyed.free_in_gaps(t, surveyed.local_noise(t.estimate, t.noise_level, t.nominal.step))
-            tracks[i] = surveyed.relaid(t, survey.fixes) if turn < RELAID else surveyed.cut_ends(t)
+        # a tunnel's first curve is a guess: where angles lead through it, it is laid until it stays
+        astray = any(t.slopes is not None and float(np.abs(t.axis).max()) > SETTLED for t in tracks)
+        again = turn < RELAID or (astray and turn < MOST_RELAID)
+        tracks = [surveyed.relaid(t, survey.fixes) if again else surveyed.cut_ends(t) for t in tracks]
+        turn, left = turn + 1, left if again else left - 1
     tell("estimate", ROUNDS, ROUNDS)
     return tracks, offsets
 

@@ -325,7 +325,9 @@ def _moved(model: TrackModel, chains: list[MapChain], told: list[dict[str, Any]]
         mean, P = chains[i].marginals()
         nodes = chains[i].start + SPACING * np.arange(len(mean), dtype=np.float64)
         shift[i] = CubicSpline(nodes, mean[:, 0])(s)
-        between = np.asarray(shift[i] - np.interp(s, nodes, mean[:, 0]), np.float64)  # what the nodes do not tell of the way between them
+        between = np.asarray(
+            shift[i] - np.interp(s, nodes, mean[:, 0]), np.float64
+        )  # what the nodes do not tell of the way between them
         variance[i] = np.asarray(np.interp(s, nodes, P[:, 0, 0] + _spread(s, between, nodes)))
     _meet(model, shift, touched)
     tables: dict[str, KnotTable] = {}
