@@ -105,6 +105,20 @@ def test_sigmas_of_a_calibration_in_the_order_of_the_causes() -> None:
     np.testing.assert_allclose(got[6], 2.0 * made.sigma_matrix[0, 1], rtol=1e-9)
 
 
+def test_directions_are_found_with_the_parameters() -> None:
+    """Large changes, no noise: to first order alone the directions would be wrong by the change."""
+    from railnav.inertial.imu_diagnosis import _nine
+
+    rng = np.random.default_rng(1)
+    up = rng.normal(size=(14, 3))
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    truth = np.array([0.01, -0.02, 0.015, 0.02, -0.01, 0.03, 0.02, -0.03, 0.01])
+    half = 0.5 * truth[6:]
+    response = np.array([[1.02, half[0], half[1]], [half[0], 0.99, half[2]], [half[1], half[2], 1.03]])
+    got = _nine(9.81 * (up @ response.T + truth[:3]), 9.81, 1e-6, np.zeros(9), 1e-3, 0.0)
+    np.testing.assert_allclose(got.parameters, truth, atol=1e-9)
+
+
 def test_refusals_say_why() -> None:
     call = later(100)
     with pytest.raises(EstimationError, match="holds neither triad"):

@@ -96,6 +96,9 @@ def test_temperature_polynomials_follow_the_sheet() -> None:
     sigma = warm.bias.sigma_at(303.15)
     assert np.all(np.abs(slope - made.accelerometer.bias_temperature) < 5.0 * sigma / 10.0)
     assert np.abs(made.accelerometer.bias_temperature).max() > 1e-3
+    # the matrix stands for the reference temperature: its scales are the polynomial's there
+    np.testing.assert_allclose(got.accelerometer.scale, warm.scale.at(warm.reference), atol=1e-12)
+    np.testing.assert_allclose(got.accelerometer.bias, warm.bias.at(warm.reference), atol=1e-12)
     log = made.logs[-1]
     length = np.linalg.norm(apply_calibration(log.imu, got).specific_force.mean(axis=0))
     assert length == pytest.approx(made.gravity, abs=5e-3)
@@ -224,6 +227,40 @@ def test_degrees_of_a_noisy_gyro_at_rest_are_recognised() -> None:
         EstimationError, match=r"position 01: the rates scatter .* in degrees per second; multiply them by pi/180"
     ):
         position_result(log)
+
+
+def test_the_vertical_part_of_the_earths_rotation_is_taken_off() -> None:
+    """Positions that lean to one side: without the latitude the biases would take it for their own."""
+    from railnav.inertial import EARTH_RATE, Provenance, six_position
+    from railnav.inertial.positions import Position, PositionResult
+    from railnav.inertial.procedure import _bias_at_rest
+
+    assert Provenance().gravity != 0.0
+    latitude, bias = 0.85, np.array([1e-5, -2e-5, 3e-6])
+    ups = np.array([[0.0, 0.0, -1.0], [0.6, 0.0, -0.8], [0.0, 0.6, -0.8], [0.6, 0.6, -0.529]])
+    ups /= np.linalg.norm(ups, axis=1, keepdims=True)
+    still = [
+        PositionResult(
+            "a",
+            "",
+            Position(9.8 * up, np.zeros(3), 9),
+            Position(bias + EARTH_RATE * math.sin(latitude) * up, np.zeros(3), 9),
+            False,
+            0.0,
+            1.0,
+        )
+        for up in ups
+    ]
+    ideal = six_position([9.8] * 3, [-9.8] * 3, 9.8)
+    np.testing.assert_allclose(_bias_at_rest(still, ideal, latitude).bias, bias, atol=1e-17)
+    blind = _bias_at_rest(still, ideal, None)
+    assert np.abs(blind.bias - bias).max() > 3e-5
+    # what is not seen stays in the sigma: the level part of a known latitude, all of an unknown one
+    assert blind.sigma_bias.min() >= EARTH_RATE / math.sqrt(3.0 * 4.0) * 0.999
+    seen = _bias_at_rest(still, ideal, latitude).sigma_bias
+    assert seen[0] == pytest.approx(
+        EARTH_RATE * math.cos(latitude) / math.sqrt(2.0 * 4.0) * math.sqrt(np.mean(1 - ups[:, 0] ** 2))
+    )
 
 
 def test_simulation_refuses_what_it_does_not_know() -> None:
