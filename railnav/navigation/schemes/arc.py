@@ -34,6 +34,8 @@ class ArcGains:
     memory : float
         How long fixes count in place and speed, s: theta = exp(-T/memory), alpha = 1 - theta^3, beta = 1.5 (1 - theta^2)(1 - theta),
         gamma = (1 - theta)^3/2 (fading memory, critically damped).
+    memory_alone : float
+        The same where neither odometer nor accelerometer measures, s.
     memory_with_odometer : float
         The same where an odometer measures the way, s: alpha = 1 - theta^2, beta = (1 - theta)^2.
     speed_gain : float
@@ -48,13 +50,18 @@ class ArcGains:
         s without a fix.
     speed_sigma : float
         Sigma of the speed that grows to an error along while no fix comes, m/s.
+    time_sigma : float
+        Of the stamps of the fixes, s: times the speed it is an error along.
     way_sigma : float
         Share of the way run that an odometer may be wrong by.
+    slip : float
+        Difference between the speeds of wheels and receiver, and a twentieth of the speed on top, from which the wheels slip, m/s.
     lost_fixes : int
         Fixes in a row far from all hypotheses after which the place is given up.
     """
 
     memory: float = 10.0
+    memory_alone: float = 4.0
     memory_with_odometer: float = 20.0
     speed_gain: float = 0.3
     evidence_time: float = 10.0
@@ -62,7 +69,9 @@ class ArcGains:
     confidence: float = 0.99
     coasting_after: float = 3.0
     speed_sigma: float = 0.4
+    time_sigma: float = 0.06
     way_sigma: float = 0.015
+    slip: float = 1.5
     lost_fixes: int = 10
 
 
@@ -146,10 +155,12 @@ class ArcNavigator:
         self._speed = self._bias = self._acceleration = 0.0
         self._distance = math.nan
         self._last_fix: tuple[float, float, float] | None = None  # time, easting, northing
+        self._last_velocity: tuple[float, float] | None = None
         self._since_way = 0.0
         self._sigma = UNSTATED_SIGMA
         self._missed = 0
         self._started = False
+        self._slip_until, self._slip_speed = -math.inf, 0.0
 
     @property
     def model(self) -> TrackModel:
@@ -198,6 +209,9 @@ class ArcNavigator:
                 moved = sign * abs(epoch.distance - self._distance)
                 self._speed = moved / step if step > 0.05 else self._speed
             self._distance = epoch.distance
+            if epoch.time <= self._slip_until:  # wheels that slip: the receiver's speed stands in
+                self._speed = self._slip_speed
+                moved = self._speed * step
         elif self._odometer == "speed" and math.isfinite(epoch.wheel_speed):
             self._speed = epoch.wheel_speed
             moved = 0.5 * (before + self._speed) * step
@@ -285,11 +299,16 @@ class ArcNavigator:
         best = max(range(len(along)), key=lambda i: self._places[i].log_weight)
         e = along[best] * self._places[best].way
         if self._odometer:
+            if math.isfinite(epoch.speed) and abs(abs(self._speed) - epoch.speed) > gains.slip + 0.05 * epoch.speed:
+                self._slip_until, self._slip_speed = (
+                    epoch.time + interval + 0.5,
+                    math.copysign(epoch.speed, self._speed),
+                )
             theta = math.exp(-interval / gains.memory_with_odometer)
             alpha, beta = 1.0 - theta * theta, (1.0 - theta) ** 2
             self._bias += beta * e / interval  # of the odometer's speed, m/s
         else:
-            theta = math.exp(-interval / gains.memory)
+            theta = math.exp(-interval / (gains.memory if math.isfinite(epoch.forward_force) else gains.memory_alone))
             alpha = 1.0 - theta**3
             self._speed += 1.5 * (1.0 - theta * theta) * (1.0 - theta) * e / interval
             if math.isfinite(epoch.forward_force):
@@ -307,9 +326,15 @@ class ArcNavigator:
         if math.isfinite(epoch.speed) and math.isfinite(epoch.course):
             speed = epoch.speed
             bearing = epoch.course - float(self._model.frame.convergence(easting, northing))
+        elif math.isfinite(epoch.speed) and epoch.speed < 2.0:
+            return
         elif last is not None and 0.0 < epoch.time - last[0] < 10.0:
-            de, dn = easting - last[1], northing - last[2]
-            speed, bearing = math.hypot(de, dn) / (epoch.time - last[0]), math.atan2(de, dn)
+            ve, vn = (easting - last[1]) / (epoch.time - last[0]), (northing - last[2]) / (epoch.time - last[0])
+            before, self._last_velocity = self._last_velocity, (ve, vn)
+            speed, bearing = math.hypot(ve, vn), math.atan2(ve, vn)
+            # one wild fix makes one wild speed: two in a row must agree
+            if before is None or math.hypot(ve - before[0], vn - before[1]) > 0.3 * speed:
+                return
             if speed * (epoch.time - last[0]) < 3.0 * sigma:
                 return
         else:
@@ -406,7 +431,7 @@ class ArcNavigator:
         grown = (
             gains.way_sigma * self._since_way if self._odometer else gains.speed_sigma * since + 0.025 * since * since
         )
-        sigma = math.hypot(self._sigma, grown)
+        sigma = math.hypot(self._sigma, grown, gains.time_sigma * self._speed)
         probability = min(1.0, weight[best.track])
         mode = Mode.TRACKING
         if probability < gains.confidence:
