@@ -31,6 +31,19 @@ UNITS = ("L3G4200D", "IMU440", "RT3003", "STIM300", "ASM330LHH")
     type=click.FloatRange(0, min_open=True),
     help="Accelerometer bias that may remain (1 sigma), mg.",
 )
+@click.option(
+    "--antennas",
+    nargs=2,
+    metavar="N,E,D F,R,D",
+    help="Two antennas: the measured vector from the first to the second, north, east, down, and the mounted one, forward, right, down, m.",
+)
+@click.option(
+    "--antenna-sigma",
+    type=click.FloatRange(0, min_open=True),
+    default=0.01,
+    show_default=True,
+    help="Standard deviation of each level component of the measured vector, m.",
+)
 @click.option("--fine", is_flag=True, help="Refine by zero-velocity updates over the whole rest.")
 @json_option
 def command(
@@ -41,6 +54,8 @@ def command(
     unit: str | None,
     gyro_bias: float | None,
     accelerometer_bias: float | None,
+    antennas: tuple[str, str] | None,
+    antenna_sigma: float,
     fine: bool,
     as_json: bool,
 ) -> None:
@@ -58,12 +73,14 @@ def command(
 
     from railnav.cli._terminal import print_facts, print_json, print_warnings
     from railnav.errors import EstimationError, InputError
+    from railnav.inertial.heading import heading_from_antennas
     from railnav.inertial.sensors import GRADES
     from railnav.inertial.standing import INTERVAL_95, align_standing
     from railnav.io.imu_calibration import calibrated_run, read_calibration
     from railnav.io.run import read_run
 
     window = _window(between) if between is not None else None
+    vectors = [_three(text) for text in antennas] if antennas is not None else None
     recorded = read_run(run)
     if recorded.imu is None:
         raise InputError("the run has no IMU", file=run, remedy="there is nothing to align with")
@@ -87,10 +104,13 @@ def command(
             accelerometer_bias_sigma=force,
             fine=fine,
         )
+        a, best = got.alignment, got.fine
+        roll, pitch = (a.roll, a.pitch) if best is None else (best.roll, best.pitch)
+        seen: tuple[float | None, float | None] = (None, None)
+        if vectors is not None:
+            seen = heading_from_antennas(vectors[0], vectors[1], roll=roll, pitch=pitch, sigma=antenna_sigma)
     except EstimationError as error:
         raise InputError(str(error), file=run) from error
-    a, best = got.alignment, got.fine
-    roll, pitch = (a.roll, a.pitch) if best is None else (best.roll, best.pitch)
     sigma_roll, sigma_pitch = a.sigma_roll, a.sigma_pitch
     heading = a.heading if best is None else best.heading
     sigma_heading = a.sigma_heading if best is None else float(best.sigma_attitude_n[2])
@@ -99,6 +119,7 @@ def command(
         "pitch": (pitch, sigma_pitch),
         "heading": (heading, sigma_heading),
         "latitude": (got.latitude, got.sigma_latitude),
+        "heading_by_antennas": seen,
         "heading_of_first_motion": (got.velocity_heading, got.sigma_velocity_heading),
     }
     if as_json:
@@ -137,6 +158,7 @@ def command(
             "Roll (right side down)": words("roll"),
             "Pitch (nose up)": words("pitch"),
             "Heading": words("heading", f"none: {a.note}"),
+            "Heading by two antennas": words("heading_by_antennas"),
             "Latitude": words("latitude", f"none: {got.latitude_note}"),
             "Heading of the first motion": words("heading_of_first_motion"),
             "Calibration": recorded.imu.calibration if recorded.imu else "",
@@ -149,6 +171,14 @@ def _exponent(value: float) -> int:
     from math import floor, log10
 
     return floor(log10(value)) if value > 0.0 else -5
+
+
+def _three(text: str) -> tuple[float, float, float]:
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        raise click.BadParameter(f"{text!r} is not three lengths in m, e.g. 0,2,0", param_hint="--antennas") from None
+    return x, y, z
 
 
 def _window(text: str) -> tuple[float, float]:

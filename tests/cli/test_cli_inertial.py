@@ -327,3 +327,70 @@ def test_notes_of_the_operator_are_checked(bench: Path, tmp_path: Path) -> None:
         done = run("calibrate", tmp_path / "set", "--method", "multi-position", "-o", tmp_path / "imu.toml", code=1)
         assert words in done.stderr
         assert "positions.toml" in done.stderr
+
+
+@pytest.fixture
+def still(tmp_path: Path) -> Path:
+    """A run folder of a fibre-optic unit at rest for a minute: roll 0.01, pitch -0.02, heading 2 rad at 48.85 degrees."""
+    from datetime import UTC, datetime
+
+    from railnav.attitude import dcm_from_euler
+    from railnav.io.run import write_run
+    from railnav.run import ImuStream, Run
+
+    rng = np.random.default_rng(3)
+    C = dcm_from_euler(0.01, -0.02, 2.0)
+    phi = np.radians(48.85)
+    w = C.T @ (7.292115e-5 * np.array([np.cos(phi), 0.0, -np.sin(phi)])) + rng.normal(0.0, 1e-5, (3000, 3))
+    f = C.T @ np.array([0.0, 0.0, -9.81]) + rng.normal(0.0, 1e-3, (3000, 3))
+    write_run(
+        Run("still", datetime(2026, 5, 4, tzinfo=UTC), imu=ImuStream(np.arange(1, 3001) * 0.02, w, f)),
+        tmp_path / "still",
+    )
+    return tmp_path / "still"
+
+
+def test_align_gives_heading_and_latitude_with_intervals(still: Path) -> None:
+    known = ["--latitude", "48.85", "--gyro-bias", "0.05", "--accelerometer-bias", "0.1"]
+    for extra in ([], ["--fine"]):
+        got = facts("align", still, *known, *extra)
+        for key, truth in (("roll", 0.01), ("pitch", -0.02), ("heading", 2.0)):
+            assert abs(got[f"{key}_deg"] - np.degrees(truth)) < 4.0 * got[f"sigma_{key}_deg"]
+        assert abs(got["latitude_deg"] - 48.85) < 4.0 * got["sigma_latitude_deg"]
+        assert got["sigma_heading_deg"] < 1.0
+        assert any("neither GNSS nor odometer" in remark for remark in got["remarks"])
+    words = run("align", still, *known).stdout
+    assert "Heading                 114" in words.replace("  +-", " +-")
+    assert "Latitude" in words
+    seen = facts("align", still, *known, "--antennas", "-0.83,1.82,0", "2,0,0", "--antenna-sigma", "0.02")
+    assert seen["heading_by_antennas_deg"] == pytest.approx(114.5, abs=0.5)
+    assert seen["sigma_heading_by_antennas_deg"] == pytest.approx(0.573, abs=0.01)
+    done = run("align", still, "--antennas", "-0.83,2.82,0", "2,0,0", code=1)
+    assert "longer than the mounted one" in done.stderr
+    done = run("align", still, "--antennas", "1,2", "2,0,0", code=2)
+    assert "three lengths in m" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (scaled(slice(4, 7), 1 / 9.80665), "it is in g; multiply it by 9.80665"),
+        (scaled(slice(4, 7), 100.0), "it is in Gal; multiply it by 0.01"),
+        (scaled(slice(1, 4), 57.29578 * 200), "in degrees per second; multiply them by pi/180"),
+        (put(6, slice(None), 0.0), "specific force z is 0 all the time: the axis is frozen or missing"),
+        (put(3, slice(500, 900), 0.25), "rate z stands at 0.25 for 400 samples from sample 500"),
+        (scaled(slice(6, 7), -1.0), "gravity is felt on +z, not on -z"),
+        (put(4, slice(0, None, 2), 4.0), "the vehicle moves throughout|specific force"),
+    ],
+)
+def test_align_names_what_is_wrong_with_the_log(still: Path, change, words: str) -> None:
+    spoil(still.parent, "still", change)
+    done = run("align", still, "--unit", "STIM300", code=1)
+    assert any(part in done.stderr for part in words.split("|")), done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_align_of_a_clock_that_jumps(still: Path) -> None:
+    spoil(still.parent, "still", put(0, slice(1000, None), 5.0))
+    done = run("align", still, code=1)
+    assert "imu.csv, row 1002, column time_s: time runs backwards" in done.stderr
