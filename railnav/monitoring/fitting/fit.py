@@ -180,9 +180,11 @@ def fit_design(
     fit = fit if smoother is fit else _simplified(smoother, east, north, per_point, noise)
     tell(label, 2, total)
     fit, margin, second = _with_laws(fit, east, north, per_point, noise, laws)
-    parted = judgement.split_inflections(judgement.items_of(fit.chain))
-    if len(parted) != len(fit.chain.kind) or any(a.k0 * a.k1 < 0.0 for a in judgement.items_of(fit.chain)):
-        fit = fit_plan(judgement.chain_of(parted), fit.along, east, north, per_point)
+    for _ in range(3):  # an element bends to one side
+        items = judgement.items_of(fit.chain)
+        if not any(a.k0 * a.k1 < 0.0 for a in items):
+            break
+        fit = fit_plan(judgement.chain_of(judgement.split_inflections(items)), fit.along, east, north, per_point)
     tell(label, 3, total)
     if not fit.settled:
         warnings.append(f"track {axis.track}: the elements did not come to rest; their sigmas may be too small")
@@ -474,10 +476,11 @@ def _profile(
     pick = np.arange(0, len(along), chosen.every)
     along, height = along[pick], height[pick]
     white = chosen.sigma if sigma is None else sigma
-    slope = np.gradient(height, along)
+    place = axis.along[rows][pick]
+    slope = np.gradient(height, place)
     wide = max(3, round(50.0 / chosen.spacing))
     smooth = np.convolve(slope, np.ones(wide) / wide, mode="same")
-    bend = float(np.clip(np.percentile(np.abs(np.gradient(smooth, along)), 90), 2e-5, 2e-3))
+    bend = float(np.clip(np.percentile(np.abs(np.gradient(smooth, place)), 90), 2e-5, 2e-3))
 
     def pieces(noise: Noise, part: slice) -> Pieces:
         return segmentation.segment_profile(along[part], height[part], noise, bend_scale=bend)

@@ -73,14 +73,14 @@ def chain_of(items: list[Item]) -> Chain:
         if item.smooth and j > 0:
             first[j] = last[j - 1]
         else:
-            first[j] = new(item.k0)
+            first[j] = -1 if item.k0 == 0.0 else new(item.k0)
         follows = j + 1 < m and items[j + 1].smooth
         if follows and items[j + 1].kind < elements.CLOTHOID:
             last[j] = first[j + 1]
         elif follows and item.k1 == 0.0 and items[j + 1].k0 == 0.0:
             last[j] = -1  # a point of inflection
         else:
-            last[j] = new(item.k1)
+            last[j] = -1 if item.k1 == 0.0 else new(item.k1)
     return Chain(
         np.array([item.kind for item in items], np.int64),
         np.array([item.length for item in items]),
@@ -103,9 +103,11 @@ def split_inflections(items: list[Item]) -> list[Item]:
             continue
         share = item.k0 / (item.k0 - item.k1)
         before, after = share * item.length, (1.0 - share) * item.length
-        if min(before, after) < 0.5:  # next to nothing on one side
-            k0, k1 = (0.0, item.k1) if before < after else (item.k0, 0.0)
-            out.append(replace(item, k0=k0, k1=k1, smooth=item.smooth and k0 != 0.0))
+        last = out[-1] if out else None
+        if before < 0.5 and (not item.smooth or (last is not None and last.kind >= elements.CLOTHOID)):
+            if item.smooth and last is not None:
+                out[-1] = replace(last, k1=0.0)
+            out.append(replace(item, k0=0.0))
             continue
         one = np.array([0.0])
         plan = Plan(

@@ -7,7 +7,9 @@ axis from their feet, which move with it; gross errors weigh less. Lengths are t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -225,7 +227,7 @@ def fit_plan(
         state = _lay(chain, owner, s)
     damping, merit = 1e-5, _merit(chain, x, y, sigma, state)
     for count in range(steps):
-        given = (chain, owner, s, x, y, sigma, robust, state)
+        given = partial(_equations, chain, owner, s, x, y, sigma, robust, state)
         count_of = _OWN * m + len(chain.bend)
         step, damping = _step_of(given, held, damping, count_of)
         end = s[-1] if owner[-1] == m - 1 else None
@@ -472,11 +474,14 @@ def _factor(kkt: object) -> object:
 
 
 def _step_of(
-    given: tuple[Any, ...], held: NDArray[np.bool_] | None, damping: float, count: int
+    equations: Callable[..., tuple[Any, Any, Any, FloatArray]],
+    held: NDArray[np.bool_] | None,
+    damping: float,
+    count: int,
 ) -> tuple[FloatArray, float]:
     """Unknowns' step (count,) and the damping it took: equations without a solution are damped until they have one."""
     for _ in range(6):
-        _, _, kkt, rhs = _equations(*given, damping=damping, held=held)
+        _, _, kkt, rhs = equations(damping=damping, held=held)
         try:
             return _solve(kkt, rhs)[:count], damping
         except EstimationError:

@@ -110,10 +110,7 @@ def fit_stretches(
     robust = np.ones(len(y))
     settled = False
     for count in range(steps):
-        residual, _, kkt, rhs = _equations(stretches, along, y, sigma, robust)
-        solution = _factor(kkt).solve(rhs)
-        if not np.isfinite(solution).all():
-            raise EstimationError("the pieces are not determined by the values; fewer pieces would do")
+        solution = _solved(stretches, along, y, sigma, robust)
         stretches, moved = _stepped(stretches, solution)
         owner, x = _owners(stretches, along)
         ratio = np.abs(y - _value(stretches, owner, x, 0)) / sigma
@@ -152,7 +149,7 @@ def _value(stretches: Stretches, owner: IntArray, x: FloatArray, derivative: int
 
 
 def _equations(
-    stretches: Stretches, along: FloatArray, y: FloatArray, sigma: FloatArray, robust: FloatArray
+    stretches: Stretches, along: FloatArray, y: FloatArray, sigma: FloatArray, robust: FloatArray, damping: float = 0.0
 ) -> tuple[FloatArray, Any, Any, FloatArray]:
     from scipy import sparse
 
@@ -216,9 +213,27 @@ def _equations(
     conditions = sparse.csr_array((data, (rows, cols)), shape=(len(rest), per * m))
     normal = design.T @ design
     diagonal = normal.diagonal().reshape(m, per)
-    trace = np.tile(np.maximum(diagonal.max(axis=0), 1e-30) * np.array([*[0.0] * k, 1e-9, 1e-12]), m)
+    trace = np.tile(np.maximum(diagonal.max(axis=0), 1e-30) * np.array([*[1e-12] * k, 1e-9, 1e-12]), m)
+    trace = trace + damping * np.tile(np.maximum(diagonal.max(axis=0), 1e-30), m)
     kkt = sparse.block_array([[normal + sparse.diags_array(trace), conditions.T], [conditions, None]], format="csc")
     return residual, design, kkt, np.concatenate([-(design.T @ (weight * residual)), rest])
+
+
+def _solved(
+    stretches: Stretches, along: FloatArray, y: FloatArray, sigma: FloatArray, robust: FloatArray
+) -> FloatArray:
+    """The step; equations without a solution are damped until they have one."""
+    damping = 0.0
+    for _ in range(6):
+        _, _, kkt, rhs = _equations(stretches, along, y, sigma, robust, damping)
+        try:
+            solution: FloatArray = _factor(kkt).solve(rhs)
+        except EstimationError:
+            solution = np.full(1, np.nan)
+        if np.isfinite(solution).all():
+            return solution
+        damping = max(damping * 100.0, 1e-8)
+    raise EstimationError("the pieces are not determined by the values; fewer pieces would do")
 
 
 def _factor(kkt: Any) -> Any:
