@@ -74,9 +74,7 @@ def main() -> None:
     noise = unit_noise(run.imu, between=(0.0, got.end), terms=("quantisation", "random_walk"))
     for what, scale, unit in (("gyro", 60 / DEGREE, "deg/sqrt(h)"), ("accelerometer", 60.0, "m/s/sqrt(h)")):
         values = [noise.fits[f"{what} {axis}"].random_walk * scale for axis in "xyz"]
-        print(
-            f"{what} random walk over the rest: {values[0]:.3f}, {values[1]:.3f}, {values[2]:.3f} {unit} (engine running; 2 s show no floor)"
-        )
+        print(f"{what} random walk over the rest: {values[0]:.3f}, {values[1]:.3f}, {values[2]:.3f} {unit}")
     print("(standing, engine running; two seconds show no floor)")
     # strapdown from the rest on: pitch and forward bias cannot be told apart at rest, so the mean of the first second is what stands
     still = run.imu.time <= 1.0
@@ -90,8 +88,8 @@ def main() -> None:
     e = speed - run.gnss.speed
     inside = run.gnss.time <= 30.0
     print(
-        f"speed of the free strapdown against GNSS: rms {np.sqrt(np.mean(e[inside] ** 2)):.2f} m/s over 30 s, {e[inside][-1]:+.2f} at the end "
-        f"(of {run.gnss.speed[inside][-1]:.2f}; GNSS sigma {np.median(run.gnss.sigma_speed):.2f})"
+        f"speed of the free strapdown against GNSS: rms {np.sqrt(np.mean(e[inside] ** 2)):.2f} m/s over 30 s, {e[inside][-1]:+.2f} at "
+        f"the end (of {run.gnss.speed[inside][-1]:.2f}; GNSS sigma {np.median(run.gnss.sigma_speed):.2f})"
     )
 
 

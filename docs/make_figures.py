@@ -100,16 +100,16 @@ PAGES = {
             Section(
                 "train-start",
                 "A real train at rest and starting",
-                "Thirty seconds of a train without odometer and model: what its inertial unit tells standing, and how well it alone follows "
-                "the start.",
+                "Thirty seconds of a train without odometer and model: what its inertial unit tells standing, and how well it alone "
+                "follows the start.",
                 "python benchmarks/standing_train.py",
                 real_data=True,
             ),
             Section(
                 "claims",
                 "What the inertial sources claim",
-                "Every claim of the two sources behind the inertial suite, measured again on simulated data: what the source says, what "
-                "comes out, and why where it cannot hold.",
+                "Every claim of the two sources behind the inertial suite, measured again on simulated data: what the source says, "
+                "what comes out, and why where it cannot hold.",
                 "python benchmarks/claims.py",
             ),
             Section(
