@@ -37,6 +37,8 @@ BLOCKS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 FLOOR = 2e-5
 #: Least random walk, rad per sqrt(s): 0.007 degrees per root hour; no survey car's gyros are believed to be better.
 LEAST_WALK = 2e-6
+#: A slope this many white sigma off the running median of so many nodes, and at least so far, rad, is a gross error.
+SLIP_RATIO, SLIP_NODES, LEAST_SLIP = 10.0, 31, 2e-3
 #: A gap in the angles longer than this is not interpolated, s.
 LONGEST_GAP = 2.0
 
@@ -192,7 +194,37 @@ def slopes_of(
             return None
     slope = None if axis is None else np.gradient(axis, track.nominal.step)
     error = angle_error(value, time, slope)
+    if slope is not None:
+        value = _without_slips(value, slope, error)
     usual = float(np.median(count[count > 0]))
     variance = error.white**2 * usual / np.maximum(count, 1.0)
     K = len(value)
     return Slopes(value, lead, variance, np.full(K, FIRST_ERROR), np.full(K, error.walk))
+
+
+def _without_slips(value: FloatArray, slope: FloatArray, error: AngleError) -> FloatArray:
+    """Slopes without those that stand alone against the axis and against their own neighbours: gross errors of a link."""
+    from scipy.ndimage import median_filter
+
+    out = value.copy()
+    for row in out:
+        at = np.flatnonzero(np.isfinite(row))
+        if len(at) < SLIP_NODES:
+            continue
+        rest = row[at] - slope[at]
+        apart = np.abs(rest - median_filter(rest, SLIP_NODES, mode="nearest"))
+        row[at[apart > max(SLIP_RATIO * error.white, LEAST_SLIP)]] = np.nan
+    return out
+
+
+def slips(track: Surveyed) -> list[tuple[int, int, float]]:
+    """Slopes that were set aside: run of the track, node, and how far off, rad."""
+    if track.slopes is None:
+        return []
+    laid = lay_angles(track)
+    if laid is None:
+        return []
+    value = laid[0]
+    gone = np.isfinite(value) & ~np.isfinite(track.slopes.value)
+    slope = np.gradient(track.axis, track.nominal.step)
+    return [(int(k), int(i), float(value[k, i] - slope[i])) for k, i in np.argwhere(gone)]

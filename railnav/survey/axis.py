@@ -76,6 +76,11 @@ class Slopes:
         """Rows that measure anything."""
         return np.flatnonzero(np.isfinite(self.value).any(axis=1)).astype(np.int64)
 
+    def of(self, run: int) -> Slopes:
+        """One run alone."""
+        k = slice(run, run + 1)
+        return Slopes(self.value[k], self.lead[k], self.variance[k], self.first[k], self.walk[k])
+
     def part(self, first: int, last: int) -> Slopes:
         """Nodes first..last-1."""
         k = slice(first, last)

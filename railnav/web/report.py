@@ -229,7 +229,9 @@ def _signed(value: float | None) -> str:
 
 
 def build_sections(build: Mapping[str, Any]) -> list[Section]:
-    """The sections on a build: its runs, its tracks, its warnings."""
+    """The sections on a build: its runs, its tracks, where to survey again, gross errors, repeatability, its warnings."""
+    from railnav.web.survey import survey_sections
+
     columns, rows, left = run_rows(build)
     parts: list[Figure | Table | Code | Warnings] = [Table(columns, rows, left)]
     sections = [
@@ -242,6 +244,7 @@ def build_sections(build: Mapping[str, Any]) -> list[Section]:
     ]
     columns, rows, left = track_rows(build)
     sections.append(Section("The tracks", "", [Table(columns, rows[:200], left)]))
+    sections += survey_sections(build)
     if build.get("warnings"):
         sections.append(Section("What to know about this build", "", [Warnings([str(w) for w in build["warnings"]])]))
     return sections

@@ -493,3 +493,28 @@ def test_one_run_alone_is_built_and_warned_about():
     assert rms(model, "up", axis) < 0.05
     assert any("rests on one run" in w for w in report(model)["warnings"])
     assert any("assumed" in w for w in report(model)["warnings"])
+
+
+# ---------------------------------------------------------------------------------------- verdicts and repeatability
+
+
+def test_every_gross_error_is_told_with_time_place_size_and_reason():
+    runs, axis, frame, _ = single_line(3, km=2.0)
+    latitude = runs[0].gnss.latitude.copy()
+    latitude[200] += np.radians(20.0 / 111_000)
+    told = report(build([changed(runs[0], latitude=latitude), *runs[1:]]))["verdicts"]
+    fix = next(v for v in told["list"] if v["what"] == "fix" and v["run"] == "run-1")
+    assert fix["time_s"] == pytest.approx(runs[0].gnss.time[200])
+    assert fix["size"] > 1.0
+    assert fix["reason"]
+    assert told["total"] >= len(told["list"]) >= 1
+
+
+def test_repeatability_between_dates_is_a_histogram():
+    runs, _, _, _ = single_line(4, km=3.0)
+    (told,) = report(build(runs))["repeatability"]
+    assert told["receiver"] == "survey"
+    assert told["pairs"] == 3
+    assert 0.97 * told["points"] <= sum(told["counts"]) <= told["points"]
+    assert 0.004 < told["rms_m"] < 0.03  # 17 mm white and 10 mm correlated, smoothed, of two runs
+    assert report(build(runs[:1]))["repeatability"] == []
