@@ -28,7 +28,13 @@ def survey_sections(build: Mapping[str, Any]) -> list[Section]:
     """
     sections = []
     again = [
-        (str(t["track"]), str(p["reason"]), f"{p['from_m']:.0f}", f"{p['to_m']:.0f}", words.length(p["sigma_m"], 2))
+        (
+            str(t["track"]),
+            str(p.get("reason", "")),
+            f"{p['from_m']:.0f}",
+            f"{p['to_m']:.0f}",
+            words.length(p.get("sigma_m"), 2),
+        )
         for t in build.get("tracks", [])
         for p in t.get("survey_again") or []
     ]
@@ -57,7 +63,7 @@ def survey_sections(build: Mapping[str, Any]) -> list[Section]:
     found = build.get("repeatability") or []
     if found:
         told = "; ".join(
-            f"{r['receiver'] or 'unknown'}: {words.length(r['rms_m'], 3)} RMS, 95 % within {words.length(r['q95_m'], 3)}, {r['pairs']} pairs"
+            f"{r['receiver'] or 'unknown'}: {words.length(r['rms_m'], 3)} RMS, 95 % {words.length(r['q95_m'], 3)}, {r['pairs']} pairs"
             for r in found
         )
         sections.append(

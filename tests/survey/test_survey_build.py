@@ -499,7 +499,7 @@ def test_one_run_alone_is_built_and_warned_about():
 
 
 def test_every_gross_error_is_told_with_time_place_size_and_reason():
-    runs, axis, frame, _ = single_line(3, km=2.0)
+    runs, _axis, _frame, _ = single_line(3, km=2.0)
     latitude = runs[0].gnss.latitude.copy()
     latitude[200] += np.radians(20.0 / 111_000)
     told = report(build([changed(runs[0], latitude=latitude), *runs[1:]]))["verdicts"]
