@@ -180,7 +180,7 @@ from railnav.navigation.measurements._kernels import (
     wheel_row,
 )
 from railnav.navigation.standing import _kernels as standing
-from railnav.navigation.standing._kernels import depart, kick, remember, stands, watch
+from railnav.navigation.standing._kernels import depart, heaviest, kick, remember, stands, watch
 
 # ---------------------------------------------------------------- what all hypotheses share
 
@@ -374,14 +374,19 @@ def sense_all(fil, net, shared, bank, work, row, dt):
             for j in range(i_d):
                 bank.P_sqrt[h, i_d, j] = 0.0
             bank.P_sqrt[h, i_d, i_d] = fil.settings[K_ODOMETER_SIGMA]
-    for i in range(bank.live[0]):
-        h = bank.live[1 + i]
-        x = bank.x[h]
-        if wheel:
-            evidence, slip, shake = wheel_row(fil, shared, bank, work, h, row)
+    if wheel:
+        leader = heaviest(bank)
+        for i in range(-1, bank.live[0]):
+            h = leader if i < 0 else bank.live[1 + i]
+            if i >= 0 and h == leader:
+                continue
+            evidence, slip, shake = wheel_row(fil, shared, bank, work, h, row, leader)
             credit(bank, h, BY_ODOMETER, evidence)
             work.slot[h, S_SLIP] = slip
             work.slot[h, S_SHAKE] += shake
+    for i in range(bank.live[0]):
+        h = bank.live[1 + i]
+        x = bank.x[h]
         path_point(net, bank, h, x[i_s], work.point[h])
         work.point[h, POINT_SIZE] = x[i_s]
         motion_rows(fil, net, shared, bank, work, h, row, dt, still)

@@ -225,6 +225,8 @@ BALISE_REACH = 10.0
 BRIDGED = 3.0
 #: Mean error across of such a bridge, of its largest.
 HELD = 0.6
+#: Sigmas past a toe at which a turnout's leg may be declared.
+GUARD = 3.0
 #: How much weaker the evidence of positions is when model or receiver are off by more than they say: sigmas five times as large.
 DOUBTED = 25.0
 #: Change of curvature a metre that the linearised course allows for, 1/m^2.

@@ -34,6 +34,7 @@ from railnav.navigation.columns import (
     COASTING,
     DIRECTION_CONFIDENCE,
     FORCE,
+    GUARD,
     INITIALISING,
     J_DECISION,
     J_EPOCH,
@@ -125,6 +126,34 @@ def _heavier(mass, logw, a, b):
 
 
 @part
+def at_a_toe(fil, bank, h):
+    """Whether another living hypothesis parts from this one at a turnout that either may not have reached yet (20, the guard).
+
+    Evidence of a turnout's legs counts only when the train is past the toe for certain.
+    """
+    i_s = fil.at[POSITION]
+    s_h = bank.x[h, i_s] - GUARD * math.sqrt(variance_of(bank.P_sqrt[h], i_s))
+    c = bank.tags[h, CURRENT]
+    for m in range(bank.live[0]):
+        g = bank.live[1 + m]
+        if g == h or bank.track[g, bank.tags[g, CURRENT]] == bank.track[h, c]:
+            continue
+        # the last track that both paths share, entered at the same coordinate
+        for i in range(c - 1, -1, -1):
+            shared = -1
+            for j in range(bank.tags[g, COUNT]):
+                if bank.track[g, j] == bank.track[h, i] and bank.begin[g, j] == bank.begin[h, i]:
+                    shared = j
+            if shared >= 0:
+                toe = bank.begin[h, i + 1]
+                s_g = bank.x[g, i_s] - GUARD * math.sqrt(variance_of(bank.P_sqrt[g], i_s))
+                if min(s_h, s_g) < toe:
+                    return True
+                break
+    return False
+
+
+@part
 def put_out(fil, net, shared, bank, work, row, out):
     """Fill one output row from the posterior: the track, where on it, its probability, the mode and the protection level."""
     k = fil.settings
@@ -200,7 +229,7 @@ def put_out(fil, net, shared, bank, work, row, out):
     out[OUT_PROBABILITY] = min(probability, 1.0)
     out[OUT_LEVEL] = mixture_bound(work.mix[0], work.mix[1], work.mix[2], live, fil.risk[0], fil.risk[1])
     out[OUT_DIRECTION] = way if forward >= DIRECTION_CONFIDENCE * standing else 0.0
-    if probability < k[K_CONFIDENCE]:
+    if probability < k[K_CONFIDENCE] or at_a_toe(fil, bank, h):
         out[OUT_MODE] = AMBIGUOUS
     elif row[TIME] - common[C_FIX_TIME] > k[K_COASTING]:
         out[OUT_MODE] = COASTING

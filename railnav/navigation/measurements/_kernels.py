@@ -197,8 +197,11 @@ def ring_speed(ring, latest, time, distance):  # odometer readings, index after 
 
 
 @part
-def wheel_row(fil, shared, bank, work, h, row):
-    """Odometer distance: a slipping wheel is forgotten until it agrees with the speed again. Gives ln p, slip and shake variances."""
+def wheel_row(fil, shared, bank, work, h, row, leader):
+    """Odometer distance: a slipping wheel is forgotten until it agrees with the speed again. Gives ln p, slip and shake variances.
+
+    A wheel slips in all hypotheses or in none, as the heaviest one (`leader`, taken first) finds: else a slip would choose a track.
+    """
     at = fil.at
     k = fil.settings
     x, P_sqrt = bank.x[h], bank.P_sqrt[h]
@@ -225,29 +228,43 @@ def wheel_row(fil, shared, bank, work, h, row):
         agrees = abs(wheel - expected) < 0.1 + 1.5 * sigma
     shake = 0.0
     info = bank.info[h]
-    if info[SLIP_SINCE] == -np.inf:
-        if abs(innovation) > k[K_SLIP_GATE] * math.sqrt(s) or differs:
-            info[SLIP_SINCE] = time
+    longest = False
+    if h != leader:
+        longest = info[SLIP_SINCE] > -np.inf and bank.info[leader, AGREE_SINCE] == -np.inf
+        begins = info[SLIP_SINCE] == -np.inf and bank.info[leader, SLIP_SINCE] == time
+        if not begins:
+            info[SLIP_SINCE] = bank.info[leader, SLIP_SINCE]
+            info[AGREE_SINCE] = bank.info[leader, AGREE_SINCE]
+    elif info[SLIP_SINCE] == -np.inf:
+        begins = abs(innovation) > k[K_SLIP_GATE] * math.sqrt(s) or differs
+    else:
+        begins = False
+        longest = time - info[SLIP_SINCE] > k[K_SLIP_LONGEST]
+        if longest:
+            info[SLIP_SINCE] = -np.inf
+            info[AGREE_SINCE] = -np.inf
+        elif agrees:
+            info[AGREE_SINCE] = min(info[AGREE_SINCE], time)
+            if time - info[AGREE_SINCE] >= 1.0:
+                info[SLIP_SINCE] = -np.inf
+        else:
             info[AGREE_SINCE] = np.inf
+    if begins:
+        info[SLIP_SINCE] = time
+        info[AGREE_SINCE] = np.inf
+        if h == leader:
             shared.common[C_SLIPS] += 1.0
-            shake = SHAKE_SPEED * SHAKE_SPEED  # what the slip has already done
-            widen(P_sqrt, i_v, SHAKE_SPEED, column)
-            if i_a >= 0:
-                widen(P_sqrt, i_a, KICK, column)
-    elif time - info[SLIP_SINCE] > k[K_SLIP_LONGEST]:  # then it is the speed that is wrong
-        info[SLIP_SINCE] = -np.inf
+        shake = SHAKE_SPEED * SHAKE_SPEED  # what the slip has already done
+        widen(P_sqrt, i_v, SHAKE_SPEED, column)
+        if i_a >= 0:
+            widen(P_sqrt, i_a, KICK, column)
+    elif longest:  # then it is the speed that is wrong
         shake = (1.0 + abs(wheel - abs(x[i_v]))) ** 2
         widen(P_sqrt, i_v, math.sqrt(shake), column)
         if i_a >= 0:
             widen(P_sqrt, i_a, KICK, column)
-    elif agrees:
-        info[AGREE_SINCE] = min(info[AGREE_SINCE], time)
-        if time - info[AGREE_SINCE] >= 1.0:
-            info[SLIP_SINCE] = -np.inf
-    else:
-        info[AGREE_SINCE] = np.inf
     slip = 0.0
-    evidence = -0.5 * (innovation * innovation / s + math.log(s))
+    evidence = -0.5 * (min(innovation * innovation / s, ROW_GATE) + math.log(s))
     if info[SLIP_SINCE] > -np.inf:
         slip = FORGET_WHEEL * FORGET_WHEEL
         widen(P_sqrt, i_d, FORGET_WHEEL, column)
@@ -317,8 +334,10 @@ def inertial_rows(fil, net, bank, work, h, row, dt):
         lean_slope += w * GAUSS_HERMITE_NODES[m] * tilted
         lean_square += w * tilted * tilted
         roll += w * probe[P_CANT_RATE] / RAIL_CENTRE_DISTANCE
-    rest = max(square - mean * mean - slope * slope, 0.0)
-    lean_rest = max(lean_square - lean * lean - lean_slope * lean_slope, 0.0)
+    # what a line does not follow is the same until the train has moved by its own uncertainty
+    again = max(1.0, sd / max(abs(v) * dt, 0.01))
+    rest = again * max(square - mean * mean - slope * slope, 0.0)
+    lean_rest = again * max(lean_square - lean * lean - lean_slope * lean_slope, 0.0)
     slope /= sd
     lean_slope /= sd
     # errors of the model's curvature are the same over some length: count them once a length, not once a row
