@@ -25,7 +25,7 @@ DRAWN_ENDINGS = (".kml", ".mfjson")
 PAGE_ENDINGS = (".html",)
 PICTURE_ENDINGS = (".png", ".svg", ".pdf", ".html")
 
-Kind = Literal["model", "solution", "run", "truth"]
+Kind = Literal["model", "solution", "run", "truth", "log"]
 
 
 def check_output(path: Path, endings: Sequence[str], *, inputs: Iterable[Path] = ()) -> Path:
@@ -111,13 +111,13 @@ def kind_of(path: Path) -> Kind:
     Parameters
     ----------
     path : Path
-        A run folder (with run.toml), a model (.gpkg, .geojson), a solution (.csv, .parquet, .gpkg, .geojson) or a truth
-        file (.csv, .parquet).
+        A run folder (with run.toml), a model (.gpkg, .geojson), a solution (.csv, .parquet, .gpkg, .geojson), a truth file (.csv,
+        .parquet) or a receiver's log (see `railnav.io.logs`).
 
     Returns
     -------
     str
-        "run", "model", "solution" or "truth".
+        "run", "model", "solution", "truth" or "log".
 
     Raises
     ------
@@ -128,6 +128,8 @@ def kind_of(path: Path) -> Kind:
         raise InputError("no such file or folder", file=path)
     if path.is_dir():
         if not (path / "run.toml").is_file():
+            if (path / "metadata.yaml").is_file():
+                return "log"
             raise InputError("the folder holds no run.toml", file=path, remedy="name a run folder, or a file")
         return "run"
     if path.name == "run.toml":
@@ -148,6 +150,10 @@ def kind_of(path: Path) -> Kind:
         if {"track", "offset_m", "heading_deg"} <= names and "mode" not in names:
             return "truth"
         return "solution"
+    from railnav.io.logs import log_format
+
+    if log_format(path) is not None:
+        return "log"
     raise InputError(
         "neither a model (.gpkg, .geojson), a solution (.csv, .parquet, .gpkg, .geojson) nor a run folder", file=path
     )
@@ -282,16 +288,3 @@ def need_report() -> None:
         raise RailnavError(
             f'pages and pictures need {" and ".join(missing)}; install with: pip install "railnav[report]"'
         )
-
-
-def run_defects(run: Path) -> list[tuple[str, str, str]]:
-    """Judge a run folder: what is wrong with it, as (kind, where, what)."""
-    from railnav.io.run import read_run
-
-    try:
-        read_run(run)
-    except InputError as error:
-        where = ", ".join([str(error.file or run), *([f"row {error.row}"] if error.row else [])])
-        where += f", column {error.column}" if error.column else ""
-        return [("run", where, f"{error.cause}; {error.remedy}" if error.remedy else error.cause)]
-    return []

@@ -16,8 +16,9 @@ from railnav.cli._verb import PATH, json_option
 def command(ctx: click.Context, file: Path, as_json: bool) -> None:
     """Check a model or a run and report every defect at once.
 
-    Of a model: gaps, kinks, tracks twice, missing heights, impossible turnouts, parts without connection, knots that
-    contradict their offsets. Of a run folder: every stream is read and judged. Exit code 1 if anything is wrong.
+    Of a model: gaps, kinks, tracks twice, missing heights, impossible turnouts, joints that are missing, knots that
+    contradict their offsets. Of a run folder: every column of every stream is judged, and a receiver's log too. Exit code 1 if
+    anything is wrong; remarks (parts of a network without connection, a model without heights) are no defects.
 
     \b
     Example:
@@ -32,9 +33,13 @@ def command(ctx: click.Context, file: Path, as_json: bool) -> None:
     if kind == "model":
         from railnav.track.validation import validate
 
-        defects = [(d.kind, d.where, d.detail) for d in validate(_files.read_model(file))]
+        found = validate(_files.read_model(file))
+        defects = [(d.kind, d.where, d.detail) for d in found if not d.remark]
+        remarks = [(d.kind, d.where, d.detail) for d in found if d.remark]
     elif kind == "run":
-        defects = _files.run_defects(file)
+        from railnav.io.run_check import run_defects
+
+        defects, remarks = run_defects(file)
     else:
         raise InputError(f"a {kind} cannot be validated", file=file, remedy="name a model or a run folder")
     if as_json:
@@ -44,12 +49,16 @@ def command(ctx: click.Context, file: Path, as_json: bool) -> None:
                 "kind": kind,
                 "valid": not defects,
                 "defects": [{"kind": k, "where": where, "detail": detail} for k, where, detail in defects],
+                "remarks": [{"kind": k, "where": where, "detail": detail} for k, where, detail in remarks],
             }
         )
-    elif defects:
-        click.secho(f"{file}: {words.count(len(defects), 'defect')}", bold=True)
+    elif defects or remarks:
+        counted = words.count(len(defects), "defect") if defects else f"no defects found ({kind})"
+        click.secho(f"{file}: {counted}", bold=True)
         for what, where, detail in defects:
             click.echo(f"  {what}: {where}: {detail}")
+        for what, where, detail in remarks:
+            click.echo(f"  remark: {what}: {where}: {detail}")
     else:
         click.echo(f"{file}: no defects found ({kind})")
     if defects:

@@ -118,10 +118,10 @@ def _read_track(
     """Elements of one track, what they miss each other by (the last: what it misses the last row), and stations."""
     number = table.number
     if len(rows) < 2:
-        table.refuse(int(rows[0]), "n", f"track {track!r} has one point only", "a track needs two")
+        table.refuse(int(rows[0]), "n", f"track {track[:60]!r} has one point only", "a track needs two")
     back = np.flatnonzero(np.diff(number["s"][rows]) < 0.0)
     if len(back):
-        table.refuse(int(rows[back[0] + 1]), "s", f"stations of track {track!r} do not grow", "order the rows by s")
+        table.refuse(int(rows[back[0] + 1]), "s", f"stations of track {track[:60]!r} do not grow", "order the rows by s")
     far = np.flatnonzero(np.abs(np.diff(number["s"][rows]) - number["ds"][rows[1:]]) > _AGREE)
     if len(far):
         i = int(rows[far[0] + 1])
@@ -130,10 +130,10 @@ def _read_track(
         )
     repeated = number["ds"][rows[1:]] < _NOTHING
     if repeated.any():
-        notes.append(f"track {track!r}: {int(repeated.sum())} rows without length passed over")
+        notes.append(f"track {track[:60]!r}: {int(repeated.sum())} rows without length passed over")
         rows = rows[np.append(~repeated, True)]  # of two rows at one point, the later tells what begins there
     if len(rows) < 2:
-        table.refuse(int(rows[0]), "ds", f"track {track!r} has no length", "remove it")
+        table.refuse(int(rows[0]), "ds", f"track {track[:60]!r} has no length", "remove it")
     radius, parameter, length = number["R"][rows], number["cl"][rows][:-1], number["ds"][rows[1:]]
     small = np.flatnonzero((radius != 0.0) & (np.abs(radius) < 5.0))
     if len(small):
@@ -175,13 +175,13 @@ def _read_track(
             table.refuse(
                 int(rows[i]),
                 "R",
-                f"the element ends {what} from the next row of track {track!r} (row {table.row_of(int(rows[i + 1]))})",
+                f"the element ends {what} from the next row of track {track[:60]!r} (row {table.row_of(int(rows[i + 1]))})",
                 "check R, cl, ds and tang of both, and that rw is easting and hw northing",
             )
         if abs(kink[i]) > SAID_KINK:
             row = table.row_of(int(rows[i + 1]))
             notes.append(
-                f"track {track!r}, row {row}: the axis turns {np.degrees(abs(kink[i])):.2f} degrees at the joint"
+                f"track {track[:60]!r}, row {row}: the axis turns {np.degrees(abs(kink[i])):.2f} degrees at the joint"
             )
     return plan, gap, kink, number["s"][rows]
 

@@ -28,10 +28,16 @@ WITHIN = 0.3
 #: Vertices nearer than this are one, m.
 _SAME_VERTEX = 0.05
 
+#: Bends that differ by more than this meet in a knot, 1/m.
+_BEND_STEP = 2e-3
+#: Knots nearer than this are one, m.
+_SAME_KNOT = 0.05
 #: Turns smaller than this are none, rad.
 _NO_TURN = 1e-9
 #: A stated end direction is met where that needs no radius below this, m.
 SHARPEST_BLEND = 15.0
+#: Of the segment at a stated end direction, this share may bend.
+_FOR_BLEND = 0.7
 #: And turns by less than this, rad.
 LARGEST_BLEND = np.radians(20.0)
 
@@ -96,15 +102,19 @@ def round_lines(
     phi[last] = 0.0
     phi[np.abs(phi) < _NO_TURN] = 0.0
     reach = within / np.maximum(np.tan(np.abs(phi) / 4.0), 1e-12)
-    cut = np.minimum(np.minimum(length, np.append(length[1:], np.inf)) / 2.0, reach)
+    # a segment that a wanted direction bends keeps most of its length for that
+    wanted = (first & np.isfinite(tau0[line]), last & np.isfinite(tau1[line]))
+    lent = np.where(wanted[0] ^ wanted[1], 1.0 - _FOR_BLEND, 0.5) * length
+    cut = np.minimum(np.minimum(lent, np.append(lent[1:], np.inf)), reach)
     cut[phi == 0.0] = 0.0
     cut_before = np.append(0.0, cut[:-1])
 
     # ends: directions wanted there
-    def blend(wanted: FloatArray, at: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
-        delta = np.where(at, wrap_angle(bearing - np.nan_to_num(wanted[line])), 0.0)
-        delta[np.isnan(wanted[line]) | (np.abs(delta) < _NO_TURN) | (np.abs(delta) > LARGEST_BLEND)] = 0.0
-        run = np.minimum(length / 2.0, 6.0 * within / np.maximum(np.abs(delta), 1e-12))  # swings out by delta run / 6
+    def blend(tau: FloatArray, at: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+        delta = np.where(at, wrap_angle(bearing - np.nan_to_num(tau[line])), 0.0)
+        delta[np.isnan(tau[line]) | (np.abs(delta) < _NO_TURN) | (np.abs(delta) > LARGEST_BLEND)] = 0.0
+        most = np.where(wanted[0] & wanted[1], 0.5, _FOR_BLEND) * length
+        run = np.minimum(most, 6.0 * within / np.maximum(np.abs(delta), 1e-12))  # swings out by delta run / 6
         delta[run < 3.0 * np.abs(delta) * SHARPEST_BLEND] = 0.0
         return delta, np.where(delta == 0.0, 0.0, run)
 
@@ -207,11 +217,33 @@ def _tabulate(
     begin = np.searchsorted(owner, np.arange(lines), side="left")
     finish = np.searchsorted(owner, np.arange(lines), side="right")
     total = run[finish] - run[begin]
-    n = np.maximum(2, np.rint(total / spacing).astype(np.int64) + 1)
+    even = np.maximum(2, np.rint(total / spacing).astype(np.int64) + 1)
+    count = np.append(0, np.cumsum(even))
+    of = np.repeat(np.arange(lines), even)
+    offset = (np.arange(count[-1]) - count[of]) / (even[of] - 1) * total[of]
+    # besides, knots on both sides of a step of the bend: between two knots it must be that of one piece
+    bend = np.where(length > 0.0, turn / np.where(length > 0.0, length, 1.0), 0.0)
+    step = np.flatnonzero((owner[1:] == owner[:-1]) & (np.abs(np.diff(bend)) > _BEND_STEP))
+    where = run[step + 1] - run[begin][owner[step]]
+    room = 0.6 * _SAME_KNOT
+    inside = (where > 2.0 * room) & (where < total[owner[step]] - 2.0 * room)
+    step, where = step[inside], where[inside]
+    of = np.concatenate([of, owner[step], owner[step]])
+    offset = np.concatenate([offset, where - room, where + room])
+    fixed = np.append(np.zeros(count[-1], bool), np.ones(2 * len(step), bool))
+    order = np.lexsort((offset, of))
+    of, offset, fixed = of[order], offset[order], fixed[order]
+    close = (of[1:] == of[:-1]) & (np.diff(offset) < _SAME_KNOT)
+    at_end = np.append(of[1:] != of[:-1], True) | np.append(True, of[1:] != of[:-1])
+    drop = np.zeros(len(of), bool)
+    drop[1:] |= close & (
+        fixed[:-1] | ~fixed[1:] | at_end[:-1]
+    )  # of two knots at one place, that of a step stays, and an end
+    drop[:-1] |= close & fixed[1:] & ~fixed[:-1]
+    drop &= ~at_end
+    of, offset = of[~drop], offset[~drop]
+    n = np.bincount(of, minlength=lines)
     before = np.append(0, np.cumsum(n))
-    of = np.repeat(np.arange(lines), n)
-    share = (np.arange(before[-1]) - before[of]) / (n[of] - 1)
-    offset = share * total[of]
     along = np.minimum(run[begin][of] + offset, run[finish][of])
     which = np.clip(np.searchsorted(run, along, side="right") - 1, begin[of], finish[of] - 1)
     part = np.clip((along - run[which]) / (run[which + 1] - run[which]), 0.0, 1.0)

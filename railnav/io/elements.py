@@ -175,7 +175,7 @@ def read_elements(path: str | Path, *, crs: Any, spacing: float = 1.0) -> TrackM
         for i in np.flatnonzero(np.abs(kink) > SAID_KINK):
             turn = np.degrees(abs(kink[i]))
             row = table.row_of(int(elements.rows[i + 1]))
-            notes.append(f"track {track!r}, row {row}: the axis turns {turn:.2f} degrees at the joint")
+            notes.append(f"track {track[:60]!r}, row {row}: the axis turns {turn:.2f} degrees at the joint")
         gaps.append(np.hypot(*gap[:-1].T))
         kinks.append(np.abs(kink[:-1]))
         try:
@@ -184,7 +184,7 @@ def read_elements(path: str | Path, *, crs: Any, spacing: float = 1.0) -> TrackM
             profile = _profile(elements, frame.ground_scale(ends[:, 0], ends[:, 1], level, bearing))
             laid = lay(frame, plan, gap=gap, profile=profile, cant=cant, spacing=spacing)
         except (CrsError, TrackError) as error:
-            raise InputError(f"track {track!r}: {error}", file=path, row=table.row_of(int(rows[0]))) from error
+            raise InputError(f"track {track[:60]!r}: {error}", file=path, row=table.row_of(int(rows[0]))) from error
         stations = np.append(elements.start, elements.start[-1] + plan.length[-1])
         posts = np.column_stack([laid.offset(plan.edges), stations])
         sections.append(
@@ -262,7 +262,7 @@ def _in_order(table: Table, track: str, rows: IntArray) -> IntArray:
     if len(again):
         i = int(rows[again[0] + 1])
         number = table.number["sequence"][i]
-        table.refuse(i, "sequence", f"{number:g} stands twice in track {track!r}", "number the elements of a track")
+        table.refuse(i, "sequence", f"{number:g} stands twice in track {track[:60]!r}", "number the elements of a track")
     return rows
 
 
@@ -270,13 +270,13 @@ def _check_heights(table: Table, track: str, elements: _Elements, notes: list[st
     known = np.isfinite(elements.height)
     if known.any() and not known.all():
         i = int(elements.rows[np.argmin(known)])
-        table.refuse(i, "height_m", f"is empty while track {track!r} has heights", "give all of a track or none")
+        table.refuse(i, "height_m", f"is empty while track {track[:60]!r} has heights", "give all of a track or none")
     sloped = np.isfinite(elements.gradient)
     if sloped.any() and not known.any():
-        notes.append(f"track {track!r}: gradients without heights passed over")
+        notes.append(f"track {track[:60]!r}: gradients without heights passed over")
     elif sloped.any() and not sloped.all():
         i = int(elements.rows[np.argmin(sloped)])
-        table.refuse(i, "gradient", f"is empty while track {track!r} has gradients", "give all of a track or none")
+        table.refuse(i, "gradient", f"is empty while track {track[:60]!r} has gradients", "give all of a track or none")
 
 
 def _closing(table: Table, track: str, elements: _Elements) -> tuple[FloatArray, FloatArray]:
@@ -290,7 +290,7 @@ def _closing(table: Table, track: str, elements: _Elements) -> tuple[FloatArray,
         table.refuse(
             int(elements.rows[i]),
             "element",
-            f"the element ends {what} from the start of the next one of track {track!r} (row "
+            f"the element ends {what} from the start of the next one of track {track[:60]!r} (row "
             f"{table.row_of(int(elements.rows[i + 1]))})",
             "check its kind, length, radii and their signs (right is positive), and that all are of this plane",
         )

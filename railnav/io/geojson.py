@@ -341,7 +341,8 @@ def _word(value: Any) -> str | None:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    """A number that a float can hold: JSON may write whole ones of any size."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and -1e300 < value < 1e300
 
 
 def _list(value: Any, key: str, shape: tuple[int, ...], refuse: Any) -> FloatArray | None:

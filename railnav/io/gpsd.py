@@ -117,7 +117,8 @@ def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> 
 
 def _number(report: dict[str, Any], key: str) -> float:
     value = report.get(key)
-    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else np.nan
+    known = isinstance(value, int | float) and not isinstance(value, bool) and -1e15 < value < 1e15
+    return float(value) if known else np.nan  # type: ignore[arg-type]
 
 
 def _sky(report: dict[str, Any]) -> tuple[float, float]:

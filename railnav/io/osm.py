@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,11 @@ TRACKS = frozenset({"rail", "light_rail", "subway", "tram", "narrow_gauge"})
 WITHIN = 0.3
 #: Directions at a node are taken over this length of each end, m.
 CHORD = 10.0
+#: Vertices this near to a node, and no further than this off the straight to the next, only hide its direction, m.
+CALM_REACH = 25.0
+CALM = 0.15
+#: No train passes a vertex that turns by more than this, rad.
+DOUBLES_BACK = math.radians(100.0)
 #: A train passes a drawn node when it turns by less than this, rad: tight curves are drawn with few vertices.
 LARGEST_TURN = math.radians(60.0)
 #: Mile posts are laid on tracks of their line this near, m.
@@ -357,19 +363,49 @@ def _lines(
     """Vertices of every section, near-repeated ones left out; sections of no length are dropped."""
     lines: list[FloatArray] = []
     kept: list[_Chain] = []
-    for chain in chains:
+    for chain in (part for whole in chains for part in _unfolded(whole, known, grid, notes)):
         points = grid[np.searchsorted(known, chain.nodes)]
         keep = np.append(True, np.hypot(*np.diff(points, axis=0).T) >= _SAME_VERTEX)
         if not keep[-1]:  # the end stays, what lies upon it goes
             keep[np.flatnonzero(keep)[-1]] = keep.sum() == 1
             keep[-1] = True
-        line = points[keep]
+        line = _calm(_calm(points[keep])[::-1])[::-1]
         if len(line) < 2 or np.hypot(*np.diff(line, axis=0).T).min() < 1e-3:
             notes.append(f"way {chain.ways[0]}: {len(chain.nodes)} nodes upon each other passed over")
             continue
         lines.append(line)
         kept.append(chain)
     return lines, kept
+
+
+def _unfolded(chain: _Chain, known: IntArray, grid: FloatArray, notes: list[str]) -> list[_Chain]:
+    """A section parted where it doubles back: there a train comes to a stand, no curve leads on."""
+    points = grid[np.searchsorted(known, chain.nodes)]
+    step = np.diff(points, axis=0)
+    bearing = np.arctan2(step[:, 0], step[:, 1])
+    back = np.flatnonzero(np.abs(wrap_angle(np.diff(bearing))) > DOUBLES_BACK) + 1
+    back = back[[min(np.hypot(*step[i - 1]), np.hypot(*step[i])) > 1.0 for i in back.tolist()]] if len(back) else back
+    if not len(back):
+        return [chain]
+    notes.append(
+        f"way {chain.ways[int(back[0])]} doubles back at node {chain.nodes[int(back[0])]}: no train passes there"
+    )
+    borders = [0, *back.tolist(), len(chain.ways)]
+    return [_Chain(chain.nodes[a : b + 1], chain.ways[a:b]) for a, b in pairwise(borders)]
+
+
+def _calm(line: FloatArray) -> FloatArray:
+    """Leave out vertices near the first one that lie on the way to the next but for a hand's breadth: short steps hide directions."""
+    reach = np.hypot(*(line[1:] - line[0]).T)
+    for j in range(int(np.searchsorted(np.maximum.accumulate(reach), CALM_REACH, side="right")), 1, -1):
+        if j >= len(line):
+            continue
+        ahead = (line[j] - line[0]) / max(float(reach[j - 1]), 1e-9)
+        inner = line[1:j] - line[0]
+        off = np.abs(inner[:, 0] * ahead[1] - inner[:, 1] * ahead[0])
+        if off.max() <= CALM:
+            return np.concatenate([line[:1], line[j:]])
+    return line
 
 
 def _names(chains: Sequence[_Chain]) -> list[str]:

@@ -71,7 +71,7 @@ def read_document(path: Path, *, what: str, too_large: str) -> Any:
     try:
         root = None if typed else etree.fromstring(data, parser)
     except (etree.XMLSyntaxError, ValueError) as error:
-        cause = " ".join(str(error).split())
+        cause = " ".join(str(error).split())[:200]
         raise InputError(f"is no XML ({cause})", file=path, remedy="export it again; it may be cut short") from error
     if root is None or root.getroottree().docinfo.internalDTD is not None:
         raise InputError(

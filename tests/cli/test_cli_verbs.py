@@ -83,7 +83,8 @@ def test_info_of_a_solution_and_of_truth(here: Path) -> None:
 
 
 def test_validate_finds_nothing_in_good_data(here: Path) -> None:
-    assert run_json("validate", "line.gpkg") == {"file": "line.gpkg", "kind": "model", "valid": True, "defects": []}
+    good = {"file": "line.gpkg", "kind": "model", "valid": True, "defects": [], "remarks": []}
+    assert run_json("validate", "line.gpkg") == good
     assert "no defects" in run("validate", "line.gpkg")
     assert run_json("validate", "service")["valid"]
 
