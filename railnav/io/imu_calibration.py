@@ -284,8 +284,8 @@ def calibration_text(calibration: ImuCalibration) -> str:
                 f"[{name}.temperature]",
                 "# rows: powers of (temperature - centre)/half range; columns: x, y, z",
             ]
-            lines.append(f"reference_c = {float(warm.reference - CELSIUS)!r}")
-            lines.append(f"centre_c = {float(warm.bias.centre - CELSIUS)!r}")
+            lines.append(f"reference_c = {round(float(warm.reference - CELSIUS), 9)!r}")
+            lines.append(f"centre_c = {round(float(warm.bias.centre - CELSIUS), 9)!r}")
             lines.append(f"half_range_c = {float(warm.bias.half_range)!r}")
             lines.append(f"bias_{unit} = {_matrix(warm.bias.coefficients)}")
             lines.append(f"scale = {_matrix(warm.scale.coefficients)}")

@@ -102,7 +102,11 @@ def read_positions(path: str | Path) -> PositionSet:
         raise InputError("does not exist", file=path, remedy="name a folder of positions")
     if path.is_file() or (path / CONTENTS).is_file():
         imu, run = _read(path)
-        return _known(PositionSet((PositionLog(path.stem, imu),), whole=True), [run] if run else [], None)
+        return _known(
+            PositionSet((PositionLog(path.name if path.is_dir() else path.stem, imu),), whole=True),
+            [run] if run else [],
+            None,
+        )
     notes = _notes(path / NOTES)
     if notes is not None and notes.position:
         files = [_member(path, one.log, k) for k, one in enumerate(notes.position)]
@@ -126,7 +130,7 @@ def read_positions(path: str | Path) -> PositionSet:
         told = notes.position[k] if notes is not None and notes.position else _Position(file.name)
         logs.append(
             PositionLog(
-                file.stem,
+                file.name if file.is_dir() else file.stem,
                 imu,
                 up=_up(told.up, path / NOTES, k),
                 rate=None if told.rate_deg_s is None else float(np.deg2rad(told.rate_deg_s)),

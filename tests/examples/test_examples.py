@@ -16,7 +16,7 @@ def run(name: str) -> Any:
 
 
 def test_every_example_is_tested():
-    assert {p.stem for p in FOLDER.glob("*.py")} == {"own_track", "simulate_and_judge", "build_and_navigate"}
+    assert {p.stem for p in FOLDER.glob("*.py")} == {"own_track", "simulate_and_judge", "build_and_navigate", "calibrate_imu"}
 
 
 def test_own_track(capsys):
@@ -46,3 +46,12 @@ def test_build_and_navigate(capsys):
     assert evaluation.across_statistics.rms < 0.05
     assert evaluation.selection.compared_by == "distance"
     assert evaluation.selection.rate == 1.0
+
+
+def test_calibrate_imu(capsys):
+    unit, health = run("calibrate_imu")
+    said = capsys.readouterr().out
+    assert "accelerometer x: bias" in said
+    assert "a year later: accelerometer scale y moved by +3.1" in said
+    assert unit.accelerometer.positions == 18
+    assert not health.healthy
