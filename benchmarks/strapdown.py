@@ -1,7 +1,9 @@
 """Strapdown integration: IMU samples a second on one core, with and without a filter, and the error of each scheme on a manoeuvre.
 
 Run `python benchmarks/strapdown.py [--samples 500000] [--repeats 5] [--json PATH]`. Time is CPU time of this thread, so that a busy
-machine does not count; the best of the repeats is given. The error is against the finest run of the third-order scheme.
+machine does not count; the best of the repeats is given. The error is against the finest run of the third-order scheme. The peer in the
+same run is the conventional form of the fifteen-state filter, P = Phi P Phi^T + Q with dense matrices in numpy, around the same strapdown
+step: published filters in Python are of its kind.
 """
 
 from __future__ import annotations
@@ -15,14 +17,15 @@ from pathlib import Path
 import numpy as np
 
 from railnav.inertial._kernels import strapdown_kernel
-from railnav.inertial.loose import ImuNoise, InitialSigma, integrate_gnss
+from railnav.inertial.aided import Fixes, Unknowns, VehicleMotion, integrate
+from railnav.inertial.loose import ImuNoise, InitialSigma
 from railnav.inertial.mechanization import GravityField, NavigationState, mechanize
 
 SCHEMES = ("coning", "matrix", "euler", "predictor", "predictor_first_order")
 #: Bar of the issue, samples/s.
 BAR = 2e6
-#: Bar of the fifteen-state square-root filter, samples/s with the covariance carried at each.
-FILTER_BAR = 160e3
+#: Bars of the square-root filter by its states, samples/s with the covariance carried at each.
+FILTER_BARS = {15: 160e3, 21: 70e3}
 
 
 def samples(n: int, interval: float, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -64,7 +67,7 @@ def speeds(n: int, repeats: int) -> dict[str, float]:
 
 
 def filter_speeds(n: int, repeats: int) -> dict[str, float]:
-    """Samples a second of the loose closed loop at 100 Hz, by rate of the GNSS fixes."""
+    """Samples a second of the closed loop at 100 Hz: states, GNSS rate, smoother."""
     h = 0.01
     rate, force = samples(n, h)
     t = np.arange(1, n + 1) * h
@@ -72,14 +75,25 @@ def filter_speeds(n: int, repeats: int) -> dict[str, float]:
     path = mechanize(start, h, rate, force)
     initial = InitialSigma(np.full(3, 2.0), np.full(3, 0.2), np.array([0.01, 0.01, 0.05]), 1e-4, 0.01)
     noise = ImuNoise(1e-4, 2e-3, 1e-4, 5e-3)
+    scales = Unknowns(gyro_scale=1e-3, accelerometer_scale=1e-3, gyro_scale_walk=1e-5, accelerometer_scale_walk=1e-5)
+    car = Unknowns(axle_arm=1.0, mounting=0.03, time_offset=0.1, antenna_arm=0.1)
     result = {}
-    for fixes_hz in (1, 5):
+    for name, fixes_hz, unknowns, wheels, smooth in (
+        ("15 states, GNSS 1 Hz", 1, None, False, False),
+        ("15 states, GNSS 5 Hz", 5, None, False, False),
+        ("21 states, GNSS 1 Hz", 1, scales, False, False),
+        ("21 states, GNSS 5 Hz", 5, scales, False, False),
+        ("24 states, GNSS 5 Hz, wheels 10 Hz", 5, car, True, False),
+        ("15 states, GNSS 5 Hz, smoothed", 5, None, False, True),
+    ):
         k = np.arange(100 // fixes_hz, n, 100 // fixes_hz)
         place = np.column_stack([path.latitude[k], path.longitude[k], path.height[k]])
+        fixes = Fixes(t[k - 1], place, [1.5, 1.5, 3.0], path.velocity_n[k], [0.1] * 3)  # type: ignore[arg-type]
+        motion = VehicleMotion(t[10::10], sigma_lateral=1.0, sigma_vertical=1.0) if wheels else None
         best = np.inf
         for repeat in range(repeats + 1):
             begin = time.thread_time()
-            integrate_gnss(
+            integrate(
                 start,
                 initial,
                 t,
@@ -87,16 +101,38 @@ def filter_speeds(n: int, repeats: int) -> dict[str, float]:
                 force,
                 noise,
                 start_time=0.0,
-                fix_time=t[k - 1],
-                fix_position=place,
-                fix_velocity_n=path.velocity_n[k],
-                sigma_position=[1.5, 1.5, 3.0],
-                sigma_velocity=[0.1, 0.1, 0.1],
+                fixes=fixes,
+                vehicle_motion=motion,
+                unknowns=unknowns,
+                smooth=smooth,
+                gate=1e9,
             )
             if repeat:  # the first compiles
                 best = min(best, time.thread_time() - begin)
-        result[f"loose, GNSS {fixes_hz} Hz"] = n / best
+        result[name] = n / best
     return result
+
+
+def dense_speed(n: int) -> float:
+    """Samples a second of the conventional covariance filter in numpy, without its updates."""
+    from railnav.inertial._kernels import coning_step, error_transition_kernel
+
+    h = 0.01
+    rate, force = samples(n, h)
+    start = NavigationState.from_euler(0.83, 0.37, 120.0, velocity_n=[30.0, 10.0, 0.0], heading=0.3)
+    state = np.array([start.latitude, start.longitude, start.height, *start.velocity_n, *start.quaternion_nb])
+    field, memory, Phi = GravityField().flat(), np.zeros(13), np.empty((15, 15))
+    P = np.diag([1e-13, 1e-13, 4.0, *[0.04] * 3, 1e-4, 1e-4, 3e-3, *[1e-8] * 3, *[1e-4] * 3])
+    Q = np.diag([0.0, 0.0, 0.0, *[4e-6] * 3, *[1e-8] * 3, *[3e-11] * 3, *[8e-8] * 3]) * h
+    force_n = np.array([0.0, 0.0, -9.81])
+    coning_step(state.copy(), memory.copy(), rate[0] * h, force[0] * h, h, field)  # compile
+    error_transition_kernel(state, force_n, h, field, 600.0, 600.0, Phi)
+    begin = time.thread_time()
+    for k in range(n):
+        error_transition_kernel(state, force_n, h, field, 600.0, 600.0, Phi)
+        P = Phi @ P @ Phi.T + Q
+        coning_step(state, memory, rate[k] * h, force[k] * h, h, field)
+    return n / (time.thread_time() - begin)
 
 
 def errors() -> dict[str, dict[str, float]]:
@@ -137,14 +173,18 @@ def main(arguments: list[str] | None = None) -> None:
         print(f"{scheme:24}{rate / 1e6:18.2f}   {row}")
     print(f"bar: {BAR / 1e6:.0f} million samples/s a core")
     filtered = filter_speeds(max(1000, options.samples // 5), options.repeats)
+    print(f"{'square-root filter, covariance at every sample':48}thousand samples/s")
     for name, rate in filtered.items():
-        print(
-            f"{name:24}{rate / 1e3:18.0f} thousand samples/s, covariance carried at each (bar {FILTER_BAR / 1e3:.0f})"
-        )
+        bar = FILTER_BARS.get(int(name.split()[0])) if "smoothed" not in name else None
+        print(f"  {name:44}{rate / 1e3:12.0f}" + (f"   bar {bar / 1e3:.0f}" if bar else ""))
+    dense = dense_speed(min(20_000, options.samples))
+    ratio = filtered["15 states, GNSS 5 Hz"] / dense
+    print(f"  {'peer: 15 states, covariance by numpy':44}{dense / 1e3:12.0f}   ratio {ratio:.0f}")
     if options.json:
         result = {
             "samples_per_second": speed | filtered,
             "error_m": error,
+            "dense_numpy": dense,
             "machine": platform.processor() or platform.machine(),
         }
         options.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
