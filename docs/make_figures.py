@@ -114,10 +114,24 @@ PAGES = {
             ),
             Section(
                 "outages",
-                "Real drive without a map: the loose inertial filter with RTK withheld",
-                "A car with RTK GNSS and a low-cost IMU; the fixes left out are the truth. Causal, no constraints.",
+                "Real drive without a map: an aided IMU with RTK withheld",
+                "A car with RTK GNSS and a low-cost IMU; the fixes left out are the truth. Causal and smoothed, with and without what wheels "
+                "can do (non-holonomic constraint, zero-velocity updates); mounting, arms, time offset and scale factors are estimated.",
                 "python benchmarks/outages.py",
                 real_data=True,
+            ),
+            Section(
+                "integration",
+                "The source's integration experiments, simulated",
+                "Campus, city and road with an IMU440; GNSS whose errors last; a canyon with few satellites; two filters fused. Beside each "
+                "ratio the specification's own.",
+                "python benchmarks/integration.py",
+            ),
+            Section(
+                "map-corrector",
+                "The source's map corrector and what replaces it, simulated",
+                "The three-lobed road loop: the literal rule does not meet its own figures; the arc-length corrector does.",
+                "python benchmarks/map_corrector.py",
             ),
         ),
     ),
