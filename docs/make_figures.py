@@ -115,16 +115,16 @@ PAGES = {
             Section(
                 "outages",
                 "Real drive without a map: an aided IMU with RTK withheld",
-                "A car with RTK GNSS and a low-cost IMU; the fixes left out are the truth. Causal and smoothed, with and without what wheels "
-                "can do (non-holonomic constraint, zero-velocity updates); mounting, arms, time offset and scale factors are estimated.",
+                "A car with RTK GNSS and a low-cost IMU; the fixes left out are the truth. Causal and smoothed, with and without what "
+                "wheels can do (non-holonomic constraint, zero-velocity updates); mounting, arms, time offset and scale factors are estimated.",
                 "python benchmarks/outages.py",
                 real_data=True,
             ),
             Section(
                 "integration",
                 "The source's integration experiments, simulated",
-                "Campus, city and road with an IMU440; GNSS whose errors last; a canyon with few satellites; two filters fused. Beside each "
-                "ratio the specification's own.",
+                "Campus, city and road with an IMU440; GNSS whose errors last; a canyon with few satellites; two filters fused. Beside "
+                "each ratio the specification's own.",
                 "python benchmarks/integration.py",
             ),
             Section(
