@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 REPORT = "report.html"
 #: Survey passes over each of the two main tracks.
 PASSES = 3
+#: How far a stretch of track was moved a month after the survey, at most, m.
+MOVED = 0.08
 
 
 @click.command("demo")
@@ -160,11 +162,12 @@ def _demo(
     from railnav.web.report import demo_page, evaluation_words
 
     watch = _Watch()
-    reference, surveys, service, simulated_truth = _simulated(seed, tell)
+    reference, surveys, later, service, simulated_truth = _simulated(seed, tell)
     watch.done("simulate the survey and the service run")
     reference.to_file(folder / "bundled.gpkg")
     for survey in surveys:
         write_run(survey, folder / survey.id)
+    write_run(later, folder / later.id)
     write_run(service, folder / service.id, truth=simulated_truth)
     watch.done("write them in the formats of the files")
     model = build(surveys, progress=tell)
@@ -212,16 +215,19 @@ def _demo(
     return facts, evaluation_words(evaluation)
 
 
-def _simulated(seed: int, tell: Progress | None) -> tuple[TrackModel, list[Run], Run, Truth]:
-    """Simulate survey passes over both main tracks of the bundled line, and a train in service."""
+def _simulated(seed: int, tell: Progress | None) -> tuple[TrackModel, list[Run], Run, Run, Truth]:
+    """Simulate survey passes over both main tracks, one more a month later when some metres were moved, and a train in service."""
+    from datetime import timedelta
+
     import numpy as np
 
-    from railnav.simulation import SERVICE, SURVEY, Leg, Stop, demo_line, simulate
+    from railnav.simulation import SERVICE, SURVEY, Leg, Stop, demo_line, simulate, with_stale_track
+    from railnav.simulation.train import START
 
     reference = demo_line()
     right = tuple(sorted(track for track in reference.track_id if track.startswith("77R-")))
     left = tuple(sorted((track for track in reference.track_id if track.startswith("77L-")), reverse=True))
-    seeds = [int(number) for number in np.random.SeedSequence(seed).generate_state(2 * PASSES + 1)]
+    seeds = [int(number) for number in np.random.SeedSequence(seed).generate_state(2 * PASSES + 2)]
     surveys = []
     for number in range(2 * PASSES):
         up = number % 2 == 0
@@ -242,13 +248,24 @@ def _simulated(seed: int, tell: Progress | None) -> tuple[TrackModel, list[Run],
         )
         surveys.append(run)
         if tell:
-            tell("simulate", number + 1, 2 * PASSES + 1)
+            tell("simulate", number + 1, 2 * PASSES + 2)
+    later, _ = simulate(
+        with_stale_track(reference, "77R-03", start=5_000.0, length=300.0, slew=MOVED),
+        Leg(right, start=20.0, finish=reference.length(right[-1]) - 20.0),
+        seed=seeds[-1],
+        outfit=SURVEY,
+        run_id="later",
+        start=START + timedelta(days=30),
+        direction="up",
+    )
+    if tell:
+        tell("simulate", 2 * PASSES + 1, 2 * PASSES + 2)
     station = next(track for track in right if track == "77R-06")
     leg = Leg(right, start=60.0, finish=reference.length(right[-1]) - 60.0, stops=(Stop(station, 700.0, 45.0),))
-    service, truth = simulate(reference, leg, seed=seeds[-1], outfit=SERVICE, run_id="service", direction="up")
+    service, truth = simulate(reference, leg, seed=seeds[-2], outfit=SERVICE, run_id="service", direction="up")
     if tell:
-        tell("simulate", 2 * PASSES + 1, 2 * PASSES + 1)
-    return reference, surveys, service, truth
+        tell("simulate", 2 * PASSES + 2, 2 * PASSES + 2)
+    return reference, surveys, later, service, truth
 
 
 def _axis(found: AxisError) -> dict[str, float | None]:
@@ -260,6 +277,8 @@ def next_commands(folder: Path) -> list[str]:
     return [
         f"railnav info {folder}/line.gpkg",
         f"railnav build {folder}/survey-* -o my-line.gpkg --report my-line.html",
+        f"railnav update {folder}/line.gpkg {folder}/later -o newer.gpkg",
+        f"railnav diff {folder}/line.gpkg newer.gpkg -o moved.geojson",
         f"railnav navigate {folder}/service -m my-line.gpkg -o my-solution.gpkg --smooth",
         f"railnav evaluate my-solution.gpkg {folder}/truth.csv",
         f"railnav simulate -m {folder}/bundled.gpkg -o my-run --route 77R-01,78-01 --seed 7",

@@ -35,7 +35,7 @@ def command(old: Path, new: Path, output: Path | None, step: float, false_alarm:
 
     \b
     Example:
-      railnav diff line.gpkg line2.gpkg -o moved.geojson
+      railnav diff demo/line.gpkg line2.gpkg -o moved.geojson
     """  # noqa: D301
     from railnav.cli import _files
     from railnav.cli._survey import print_difference, write_difference

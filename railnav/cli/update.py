@@ -58,8 +58,8 @@ def command(
 
     \b
     Example:
-      railnav update line.gpkg monday tuesday -o line2.gpkg
-      railnav update line.gpkg service -o line3.gpkg --from-service
+      railnav update demo/line.gpkg demo/later -o line2.gpkg
+      railnav update demo/line.gpkg demo/service -o line3.gpkg --from-service
     """  # noqa: D301
     from railnav.cli import _files
     from railnav.cli._describe import describe_model
