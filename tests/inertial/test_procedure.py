@@ -134,6 +134,44 @@ def test_one_long_log_is_cut_where_it_rests() -> None:
         cut_positions("hand", ImuStream(stream.time, rng.normal(0, 1, gyro.shape), force))
 
 
+def test_one_long_log_on_a_table_is_cut_where_it_turns_evenly() -> None:
+    made = simulate_positions("modified-multi-position", unit="IMU440", seed=6, count=10, duration=8.0)
+    rng = np.random.default_rng(1)
+    w, f = [], []
+    for log in made.logs:
+        w += [log.imu.gyro, rng.normal(0.0, 1.0, (200, 3))]
+        f += [log.imu.specific_force, log.imu.specific_force[-1] + rng.normal(0.0, 3.0, (200, 3))]
+    gyro, force = np.vstack(w), np.vstack(f)
+    cut = cut_positions("table", ImuStream(np.arange(1, len(gyro) + 1) * 0.01, gyro, force), by_rate=True)
+    assert len(cut) == 10
+    got = calibrate_imu(cut, ["modified-multi-position"], rate=math.radians(60.0), latitude=made.latitude).calibration
+    assert np.all(np.abs(got.gyroscope.bias - made.gyroscope.bias) < 5.0 * got.gyroscope.sigma_bias)
+
+
+def test_gyros_by_turns_about_each_axis_show_their_full_matrix() -> None:
+    """Six runs, both ways about each axis: the cross-axis terms that lengths cannot tell from a turn of the triad come out too."""
+    from railnav.inertial import simulate_triad
+
+    made = simulate_positions("turns", seed=2, unit="IMU440", duration=2.0)
+    logs = []
+    for k, rate in enumerate(math.radians(60.0) * np.array([s * axis for axis in np.eye(3) for s in (1.0, -1.0)])):
+        w = simulate_triad(
+            np.tile(rate, (2000, 1)), 0.01, replace(made.gyroscope, instability=0.0), seed=50 + k
+        ).measured
+        f = simulate_triad(
+            np.tile([0.0, 0.0, -made.gravity], (2000, 1)), 0.01, made.accelerometer, seed=90 + k
+        ).measured
+        logs.append(PositionLog(f"{k}", ImuStream(np.arange(1, 2001) * 0.01, w, f), turns=np.zeros(3), turn_rates=rate))
+    triad = calibrate_imu(logs, ["turns"]).calibration.gyroscope
+    truth = np.eye(3) + np.diag(made.gyroscope.scale) + np.array(made.gyroscope.cross_axis)
+    assert np.all(np.abs(triad.matrix - np.linalg.inv(truth)) < 5.0 * triad.sigma_matrix)
+    assert np.abs(made.gyroscope.cross_axis).max() > 10.0 * triad.sigma_matrix.max()
+    with pytest.raises(EstimationError, match="0 turns, but its turn_rates_deg_s are not named"):
+        calibrate_imu([replace(log, turn_rates=None, rate=1.0) for log in logs], ["turns"])
+    with pytest.raises(EstimationError, match="determine only 3 of the 4 unknowns"):
+        calibrate_imu(logs[:4], ["turns"])
+
+
 def test_noise_is_measured_where_a_log_is_long_enough() -> None:
     made = simulate_positions("six-position", unit="IMU440", seed=1, duration=60.0)
     got = calibrated(made, "six-position")
