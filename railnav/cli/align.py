@@ -19,7 +19,7 @@ UNITS = ("L3G4200D", "IMU440", "RT3003", "STIM300", "ASM330LHH")
 @click.option(
     "--unit",
     type=click.Choice(UNITS),
-    help="Take what biases remain from this data sheet, where no calibration says it.",
+    help="Data sheet of the IMU: what biases remain without a calibration, and wander with one.",
 )
 @click.option(
     "--gyro-bias",
@@ -69,14 +69,14 @@ def command(
     Example:
       railnav align demo/service --unit IMU440
     """  # noqa: D301
-    from math import degrees, radians
+    from math import degrees, hypot, radians
 
     from railnav.cli._terminal import print_facts, print_json, print_warnings
     from railnav.errors import EstimationError, InputError
     from railnav.inertial.heading import heading_from_antennas
     from railnav.inertial.sensors import GRADES
     from railnav.inertial.standing import INTERVAL_95, align_standing
-    from railnav.io.imu_calibration import calibrated_run, read_calibration
+    from railnav.io.imu_calibration import calibrated_run, named_calibration, read_calibration
     from railnav.io.run import read_run
 
     window = _window(between) if between is not None else None
@@ -86,14 +86,30 @@ def command(
         raise InputError("the run has no IMU", file=run, remedy="there is nothing to align with")
     gyro = radians(gyro_bias) / 3600.0 if gyro_bias is not None else None
     force = 9.80665e-3 * accelerometer_bias if accelerometer_bias is not None else None
-    if calibration is not None:
-        known = read_calibration(calibration)
-        recorded = calibrated_run(recorded, calibration)
-        gyro = known.gyro_bias_sigma() if gyro is None else gyro
-        force = known.accelerometer_bias_sigma() if force is None else force
+    remarks: list[str] = []
+    sheets = None
     if unit is not None:
         sheets = GRADES[f"{unit} gyroscope"], GRADES[f"{'LSM303DLH' if unit == 'L3G4200D' else unit} accelerometer"]
-        biases = [(sheet.bias**2 + sheet.instability**2) ** 0.5 for sheet in sheets]
+    known = read_calibration(calibration) if calibration is not None else named_calibration(run)
+    recorded = calibrated_run(recorded, calibration)
+    if known is not None:
+        left = [known.gyro_bias_sigma(), known.accelerometer_bias_sigma()]
+        if sheets is not None:  # what the calibration leaves, and what the bias does in the run
+            left = [
+                None if one is None else hypot(one, sheet.instability) for one, sheet in zip(left, sheets, strict=True)
+            ]
+        elif (
+            gyro is None
+            and left[0] is not None
+            and (known.gyroscope_noise is None or known.gyroscope_noise.bias_instability == 0.0)
+        ):
+            remarks.append(
+                "the calibration does not say how far the gyros' biases wander: its own sigma is taken alone; name the data sheet "
+                "with --unit"
+            )
+        gyro, force = (left[0] if gyro is None else gyro), (left[1] if force is None else force)
+    if sheets is not None:
+        biases = [hypot(sheet.bias, sheet.instability) for sheet in sheets]
         gyro, force = (biases[0] if gyro is None else gyro), (biases[1] if force is None else force)
     try:
         got = align_standing(
@@ -139,7 +155,7 @@ def command(
             known_both = value is not None and sigma is not None
             out[f"{key}_deg"] = degrees(value) if value is not None else None
             out[f"sigma_{key}_deg"] = degrees(sigma) if known_both and sigma is not None else None
-        out |= {"heading_note": a.note, "latitude_note": got.latitude_note, "remarks": got.remarks}
+        out |= {"heading_note": a.note, "latitude_note": got.latitude_note, "remarks": [*got.remarks, *remarks]}
         print_json(out)
         return
 
@@ -164,7 +180,7 @@ def command(
             "Calibration": recorded.imu.calibration if recorded.imu else "",
         },
     )
-    print_warnings(got.remarks)
+    print_warnings([*got.remarks, *remarks])
 
 
 def _exponent(value: float) -> int:

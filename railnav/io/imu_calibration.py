@@ -250,6 +250,19 @@ def calibrated_run(run: Run, file: str | Path | None) -> Run:
     return replace(run, imu=calibrated_stream(run.imu, file))
 
 
+def named_calibration(folder: str | Path) -> ImuCalibration | None:
+    """Read the calibration that a run folder's run.toml names; None where it names none.
+
+    Raises
+    ------
+    InputError
+        The file is refused.
+    """
+    contents = tomllib.loads((Path(folder) / "run.toml").read_bytes().removeprefix(b"\xef\xbb\xbf").decode())
+    name = contents.get("imu", {}).get("calibration", "")
+    return read_calibration(Path(folder) / name) if name else None
+
+
 def calibration_text(calibration: ImuCalibration) -> str:
     """Text of a calibration file."""
     lines = [

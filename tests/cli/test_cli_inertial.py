@@ -157,7 +157,12 @@ def test_align_reads_the_calibration_and_refuses_motion(stock: Path, bench: Path
     (stock / "service" / "imu.toml").write_text((bench / "imu.toml").read_text())
     toml = stock / "service" / "run.toml"
     toml.write_text(toml.read_text().replace('file = "imu.csv"', 'file = "imu.csv"\ncalibration = "imu.toml"'))
-    assert facts("align", stock / "service")["calibration"] == "unit 7"
+    named = facts("align", stock / "service")
+    assert named["calibration"] == "unit 7"
+    assert named["gyro_bias_sigma_deg_h"] == pytest.approx(known["gyro_bias_sigma_deg_h"])
+    wider = facts("align", stock / "service", "--unit", "STIM300")
+    assert wider["gyro_bias_sigma_deg_h"] == pytest.approx(np.hypot(known["gyro_bias_sigma_deg_h"], 0.5))
+    assert any("how far the gyros' biases wander" in remark for remark in named["remarks"])
     done = run("align", stock / "service", "--calibration", bench / "imu.toml", code=1)
     assert "calibrated already (by unit 7)" in done.stderr
 
