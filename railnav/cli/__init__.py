@@ -51,6 +51,7 @@ VERBS: dict[str, tuple[str, str]] = {
         "chainage",
         "Turn published addresses into places on tracks and back, and list the kilometres of lines.",
     ),
+    "store": ("store", "List the models of a shared store, and their versions."),
     "convert": ("convert", "Write a model, a solution, a run or a log in another format."),
     "view": ("view", "Draw a model or a solution as a picture or a page."),
 }

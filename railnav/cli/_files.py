@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from railnav.errors import InputError, RailnavError
+from railnav.io.store_address import is_store
 
 if TYPE_CHECKING:
     from railnav.navigation.solution import Solution
@@ -56,6 +57,8 @@ def check_output(path: Path, endings: Sequence[str], *, inputs: Iterable[Path] =
     Traceback (most recent call last):
     railnav.errors.InputError: line.shp: an output of this ending is not known; use .gpkg or .geojson
     """
+    if is_store(path) and ".gpkg" in endings:  # a shared store says itself what it cannot take
+        return path
     if path.suffix.lower() not in endings:
         choice = " or ".join(filter(None, [", ".join(endings[:-1]), endings[-1]]))
         raise InputError("an output of this ending is not known", file=path, remedy=f"use {choice}")
@@ -124,6 +127,8 @@ def kind_of(path: Path) -> Kind:
     InputError
         If it is missing, or none of these.
     """
+    if is_store(path):
+        return "model"
     if not path.exists():
         raise InputError("no such file or folder", file=path)
     if path.is_dir():
@@ -198,8 +203,8 @@ def _kind_of_geopackage(path: Path) -> Kind:
 
 
 def read_model(path: Path) -> TrackModel:
-    """Read a model, .gpkg or .geojson."""
-    if path.suffix.lower() in (".geojson", ".json"):
+    """Read a model, .gpkg or .geojson, or of a store."""
+    if path.suffix.lower() in (".geojson", ".json") and not is_store(path):
         from railnav.io.geojson import read_geojson
 
         return read_geojson(path)
@@ -217,7 +222,7 @@ def read_solution(path: Path) -> Solution:
 
 def write_model(model: TrackModel, path: Path) -> None:
     """Write a model by its ending: a store, or what other programs read."""
-    ending = path.suffix.lower()
+    ending = "" if is_store(path) else path.suffix.lower()
     if ending in (".geojson", ".json"):
         from railnav.io.geojson import write_geojson
 

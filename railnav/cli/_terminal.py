@@ -11,6 +11,7 @@ from typing import Any
 
 import click
 
+from railnav.io.store_address import redacted
 from railnav.run import Progress
 
 #: Width of tables where there is no terminal to ask.
@@ -35,7 +36,7 @@ def plain(value: Any) -> Any:
         return value if math.isfinite(value) else None
     if value is None or isinstance(value, bool | int | str):
         return value
-    return str(value)
+    return redacted(str(value))
 
 
 def print_json(value: Mapping[str, Any]) -> None:
@@ -66,7 +67,7 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[obje
 
 def print_facts(title: str, facts: Mapping[str, object]) -> None:
     """Print a title and a list of facts on stdout; empty ones are left out."""
-    click.secho(title, bold=True)
+    click.secho(redacted(title), bold=True)
     shown = {key: str(value) for key, value in facts.items() if str(value)}
     width = max((len(key) for key in shown), default=0)
     for key, value in shown.items():

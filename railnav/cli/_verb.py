@@ -20,8 +20,10 @@ class Failure(click.ClickException):
     exit_code = 1
 
     def show(self, file: IO[Any] | None = None) -> None:
-        """Print the line."""
-        click.echo(f"railnav: error: {' '.join(self.message.split())}", file=file, err=file is None)
+        """Print the line, without the password that a store's address may hold."""
+        from railnav.io.store_address import redacted
+
+        click.echo(f"railnav: error: {redacted(' '.join(self.message.split()))}", file=file, err=file is None)
 
 
 def describe(error: BaseException) -> str:

@@ -56,6 +56,7 @@ def command(
     from railnav.cli._terminal import print_json, print_warnings
     from railnav.errors import InputError
     from railnav.io.logs import log_format
+    from railnav.io.store_address import redacted
     from railnav.io.tcp_log import is_address
 
     path = Path(source)
@@ -91,7 +92,7 @@ def command(
         print_json({"source": source, "kind": what, "output": output, **more})
     else:
         print_warnings(notes)
-        click.echo(f"{output} written ({what}{f', {fixes:,} fixes' if more else ''})")
+        click.echo(f"{redacted(str(output))} written ({what}{f', {fixes:,} fixes' if more else ''})")
 
 
 LOG_ENDINGS = (".nmea", ".pos", ".gpx", ".kml", ".csv", ".parquet")

@@ -21,6 +21,7 @@ from railnav.geodesy.grid import GridFrame
 from railnav.io.container import Container, Reader, bounds_of, create, decode_point, line_blob, opened, point_blobs
 from railnav.io.line_references import read_references, write_references
 from railnav.io.qgis_styles import add_styles
+from railnav.io.store_address import is_store
 from railnav.track.model import KNOT_COLUMNS, End, MilePosts, NodeKind, Nodes, TrackModel
 from railnav.track.records import ROW_SIZE, AxisRecords, Borders, ModelRecords, RecordSource, TrackRecords
 
@@ -81,6 +82,11 @@ def write_model(model: TrackModel, path: str | Path) -> None:
     ...     read_model(f"{folder}/line.gpkg").track_id == model.track_id
     True
     """
+    if is_store(path):  # a shared model: the same interface, another store
+        from railnav.io.postgis import write_model as save
+
+        save(model, path)
+        return
     _check_unique(model.track_id, "track", path)
     _check_unique(model.nodes.id, "node", path)
     records = model.records  # before the file that they may lie in is replaced
@@ -124,6 +130,10 @@ def read_model(path: str | Path) -> TrackModel:
     Traceback (most recent call last):
     railnav.errors.ModelError: nowhere.gpkg: does not exist; check the name
     """
+    if is_store(path):
+        from railnav.io.postgis import read_model as fetch
+
+        return fetch(path)
     with opened(path, CONTENT, newest=SCHEMA_VERSION, error=ModelError) as reader:
         frame = _read_frame(reader)
         provenance = reader.meta.get("provenance", {})
