@@ -37,6 +37,10 @@ _AROUND = 20.0
 _CUBIC_TURN = 0.5
 #: Transitions tell their law if they shift the curve by this many sigmas.
 _TELLING = 3.0
+#: A fit whose residuals are this many times the noise has failed.
+_FAILED = 5.0
+#: An element this short is nothing, m.
+_STUB = 0.1
 #: Rounds of leaving out elements.
 _ROUNDS = 5
 _LAWS = (elements.BLOSS, elements.COSINE, elements.SINE, elements.HELMERT, elements.CUBIC)
@@ -185,10 +189,17 @@ def fit_design(
         if not any(a.k0 * a.k1 < 0.0 for a in items):
             break
         fit = fit_plan(judgement.chain_of(judgement.split_inflections(items)), fit.along, east, north, per_point)
+    fit = _without_stubs(fit, east, north, per_point)
     tell(label, 3, total)
     if not fit.settled:
         warnings.append(f"track {axis.track}: the elements did not come to rest; their sigmas may be too small")
+    expected = float(np.hypot(np.mean(noise.sigma), noise.correlated))
     noise = _as_found(fit, noise, sigma)
+    if float(np.hypot(np.mean(noise.sigma), noise.correlated)) > _FAILED * expected and sigma is None:
+        raise EstimationError(
+            f"track {axis.track}: no elements were found that pass the points within {_FAILED:.0f} times their noise of "
+            f"{expected:.3f} m; state their noise (--sigma), or fit a shorter piece"
+        )
     length_sigma, bend_sigma, station_sigma = _plan_sigmas(fit, noise)
     if rounded:
         with np.errstate(divide="ignore"):
@@ -277,11 +288,34 @@ def _simplified(fit: PlanFit, east: FloatArray, north: FloatArray, sigma: FloatA
     for _ in range(_ROUNDS):
         length_sigma, bend_sigma, _ = _plan_sigmas(fit, noise)
         items = judgement.items_of(fit.chain)
-        edits = judgement.simplifications(items, bend_sigma, length_sigma)
+        least = 0.5 * float(np.median(np.diff(fit.along)))
+        edits = judgement.simplifications(items, bend_sigma, length_sigma, least=least)
         fewer = _tried(fit, edits, east, north, sigma, _spread(fit, noise))
         if fewer is fit:
             break
         fit = fewer
+    return _without_stubs(fit, east, north, sigma)
+
+
+def _without_stubs(fit: PlanFit, east: FloatArray, north: FloatArray, sigma: FloatArray) -> PlanFit:
+    """The fit without elements that shrank to nothing."""
+    for _ in range(3):
+        items = judgement.items_of(fit.chain)
+        nothing = np.zeros(len(items))
+        edits = [
+            edit
+            for edit in judgement.simplifications(items, nothing, nothing, least=_STUB)
+            if min(item.length for item in items[edit.first : edit.last]) < _STUB
+        ]
+        if not edits:
+            return fit
+        try:
+            again = fit_plan(judgement.chain_of(judgement.applied(items, edits)), fit.along, east, north, sigma)
+        except EstimationError:
+            return fit
+        if again.cost > 1.05 * fit.cost + _DEARER * len(edits):
+            return fit
+        fit = again
     return fit
 
 

@@ -127,7 +127,9 @@ def split_inflections(items: list[Item]) -> list[Item]:
     return out
 
 
-def simplifications(items: list[Item], bend_sigma: FloatArray, length_sigma: FloatArray) -> list[Edit]:
+def simplifications(
+    items: list[Item], bend_sigma: FloatArray, length_sigma: FloatArray, *, least: float = 0.5
+) -> list[Edit]:
     """Edits that leave out what the points do not speak for; none overlaps another.
 
     Parameters
@@ -137,6 +139,8 @@ def simplifications(items: list[Item], bend_sigma: FloatArray, length_sigma: Flo
         Of arcs' curvatures, 1/m.
     length_sigma : (m,) array
         m.
+    least : float
+        Shorter elements are none, m.
     """
     edits: list[Edit] = []
     free = 0
@@ -146,7 +150,7 @@ def simplifications(items: list[Item], bend_sigma: FloatArray, length_sigma: Flo
         lo = j - 1 if before is not None else j
         if lo < free:
             continue
-        edit = _without(items, j, bend_sigma, length_sigma)
+        edit = _without(items, j, bend_sigma, length_sigma, least)
         if edit is None and item.kind == elements.ARC and abs(item.k0) < NOTHING * bend_sigma[j]:
             changed = [replace(item, kind=elements.STRAIGHT, k0=0.0, k1=0.0)]
             if before is not None:
@@ -162,14 +166,14 @@ def simplifications(items: list[Item], bend_sigma: FloatArray, length_sigma: Flo
     return edits
 
 
-def _without(items: list[Item], j: int, bend_sigma: FloatArray, length_sigma: FloatArray) -> Edit | None:
+def _without(items: list[Item], j: int, bend_sigma: FloatArray, length_sigma: FloatArray, least: float) -> Edit | None:
     """The edit that leaves out element j, or makes it one with its neighbours; None where it stands."""
     item = items[j]
     before = items[j - 1] if j > 0 else None
     after = items[j + 1] if j + 1 < len(items) else None
     if before is not None and _same(before, item, bend_sigma[j - 1], bend_sigma[j]):
         return Edit(j - 1, j + 1, (replace(before, length=before.length + item.length),), 2)
-    none = item.length < _NO_LENGTH * length_sigma[j]
+    none = item.length < max(_NO_LENGTH * length_sigma[j], least)
     half = 0.5 * item.length
     if item.kind >= elements.CLOTHOID:
         if before is not None and after is not None and max(before.kind, after.kind) < elements.CLOTHOID:
@@ -182,7 +186,7 @@ def _without(items: list[Item], j: int, bend_sigma: FloatArray, length_sigma: Fl
                     replace(after, length=after.length + half, smooth=False, start=_back(after, half)),
                 )
                 return Edit(j - 1, j + 2, pair, 1)
-        if item.length < 0.5 or none:
+        if none:
             if before is not None and before.kind >= elements.CLOTHOID and item.smooth:
                 return Edit(j - 1, j + 1, (replace(before, length=before.length + item.length, k1=item.k1),), 2)
             if after is not None and after.kind >= elements.CLOTHOID and after.smooth:
@@ -203,6 +207,12 @@ def _without(items: list[Item], j: int, bend_sigma: FloatArray, length_sigma: Fl
             replace(after, length=after.length + half, smooth=True, start=_back(after, half)),
         )
         return Edit(j - 1, j + 2, pair, 1)
+    if not any(turning):
+        pair = (
+            replace(before, length=before.length + half),
+            replace(after, length=after.length + half, smooth=False, start=_back(after, half)),
+        )
+        return Edit(j - 1, j + 2, pair, 2)
     if turning[1] and not turning[0]:
         pair = (
             replace(before, length=before.length + half),

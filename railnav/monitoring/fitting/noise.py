@@ -29,6 +29,8 @@ _JUDGED = 1200
 #: Steps of the search for waves, in logarithms, and how many noises are tried.
 _STRIDES = (1.1, 0.5)
 _TRIALS = 32
+#: Longer waves bend no element: spacings, m.
+_LONGEST, _LONGEST_WAVE = 8.0, 120.0
 #: Waves must be likelier than none by this, in -2 log likelihood.
 _WORTH = 12.0
 
@@ -150,7 +152,7 @@ def likeliest(
     place = (float(np.log(white)), float(np.log(1.2 * sigma)), float(np.log(8.0 * spacing)))
     known = {place: cost(noise_of(place))}
     low = (np.log(floor), np.log(1e-3 * sigma), np.log(2.0 * spacing))
-    high = (np.log(4.0 * sigma), np.log(8.0 * sigma), np.log(max(0.2 * count * spacing, 4.0 * spacing)))
+    high = (np.log(4.0 * sigma), np.log(8.0 * sigma), np.log(max(_LONGEST * spacing, _LONGEST_WAVE)))
     for stride in _STRIDES:
         moved = True
         while moved and len(known) < _TRIALS:

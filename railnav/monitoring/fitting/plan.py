@@ -31,8 +31,8 @@ _OWN = 4
 _MOST_STEPS = 40
 #: Lengths settle within this, m.
 _SETTLED = 2e-4
-#: How far elements may miss each other on the way, m, rad.
-_APART, _TURNED = 0.02, 1e-3
+#: How far elements may miss each other on the way, sigmas of the points, and the length over which a miss of direction counts, m.
+_APART, _ARM = 2.0, 20.0
 #: Share of what points tell that every unknown is held with.
 _TRACE = np.array([1e-10, 1e-10, 1e-10, 1e-9])
 #: No track bends more than this, 1/m.
@@ -229,13 +229,13 @@ def fit_plan(
     for count in range(steps):
         given = partial(_equations, chain, owner, s, x, y, sigma, robust, state)
         count_of = _OWN * m + len(chain.bend)
-        step, damping = _step_of(given, held, damping, count_of)
+        step, damping = _step_of(given, held, damping, count_of, chain.length)
         end = s[-1] if owner[-1] == m - 1 else None
         for _ in range(7):  # a step that leads away is taken again, shorter
             trial, moved = _stepped(chain, step, end)
             if not _lawful(trial, reach):
                 damping = max(damping * 10.0, 1e-4)
-                step, damping = _step_of(given, held, damping, count_of)
+                step, damping = _step_of(given, held, damping, count_of, chain.length)
                 trial, moved = chain, 0.0
                 trial_owner, trial_s, trial_state, trial_merit = owner, s, state, merit
                 continue
@@ -248,7 +248,7 @@ def fit_plan(
                 damping = max(damping * 0.2, 1e-9)
                 break
             damping = max(damping * 10.0, 1e-4)
-            step, damping = _step_of(given, held, damping, count_of)
+            step, damping = _step_of(given, held, damping, count_of, chain.length)
         gained = merit - trial_merit
         chain, owner, s, state, merit = trial, trial_owner, trial_s, trial_state, trial_merit
         residual = _across(x, y, state)
@@ -329,6 +329,7 @@ def _equations(
     state: tuple[FloatArray, ...],
     damping: float = 0.0,
     held: NDArray[np.bool_] | None = None,
+    change: FloatArray | None = None,
 ) -> tuple[FloatArray, object, object, FloatArray]:
     """Residuals, whitened design, and the normal equations with their conditions, eq (10)."""
     from scipy import sparse
@@ -406,7 +407,7 @@ def _equations(
         [
             miss.ravel(),
             [(x[0] - chain.start[0, 0]) * np.sin(b0) + (y[0] - chain.start[0, 1]) * np.cos(b0), 0.0],
-            np.zeros(len(stay)),
+            (np.zeros(len(stay)) if change is None else change[stay]),
         ]
     )
     conditions = sparse.csr_array(
@@ -437,7 +438,9 @@ def _merit(chain: Chain, x: FloatArray, y: FloatArray, sigma: FloatArray, state:
     points = np.where(ratio > ROBUST, ROBUST * (2.0 * ratio - ROBUST), ratio**2).sum()
     ends = state[2]
     miss = chain.start[1:] - ends[:-1, :3]
-    apart = (miss[:, 0] ** 2 + miss[:, 1] ** 2).sum() / _APART**2 + (miss[:, 2] ** 2).sum() / _TURNED**2
+    allowed = _APART * float(np.median(sigma))
+    apart = (miss[:, 0] ** 2 + miss[:, 1] ** 2).sum() / allowed**2
+    apart += (miss[:, 2] ** 2).sum() / (allowed / _ARM) ** 2
     return float(points + apart)
 
 
@@ -478,14 +481,30 @@ def _step_of(
     held: NDArray[np.bool_] | None,
     damping: float,
     count: int,
+    length: FloatArray,
 ) -> tuple[FloatArray, float]:
     """Unknowns' step (count,) and the damping it took: equations without a solution are damped until they have one."""
+    m = len(length)
+    bound = _STRIDE * np.maximum(length, 0.5)
     for _ in range(6):
         _, _, kkt, rhs = equations(damping=damping, held=held)
         try:
-            return _solve(kkt, rhs)[:count], damping
+            step = _solve(kkt, rhs)[:count]
+            stays = np.zeros(m + (count - _OWN * m), bool) if held is None else held.copy()
+            change = np.zeros(len(stays))
+            for _ in range(3):  # lengths that would change too much change by what they may
+                wanted = step[_OWN - 1 : _OWN * m : _OWN]
+                over = np.append((np.abs(wanted) > 1.0001 * bound)[:-1], False) & ~stays[:m]
+                if not over.any():
+                    break
+                stays[:m] |= over
+                change[:m] = np.where(over, np.copysign(bound, wanted), change[:m])
+                _, _, kkt, rhs = equations(damping=damping, held=stays, change=change)
+                step = _solve(kkt, rhs)[:count]
         except EstimationError:
             damping = max(damping * 100.0, 1e-6)
+        else:
+            return step, damping
     raise EstimationError("the elements are not determined by the points; fewer elements would do")
 
 

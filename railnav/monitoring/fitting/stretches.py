@@ -89,7 +89,8 @@ def stretches_of_pieces(pieces: Pieces, along: FloatArray, values: FloatArray, s
         x = along[rows] - begin[j]
         degree = min(states - 1 + int(bent[j]), len(x) - 1)
         scale = max(float(x[-1]), 1e-9)
-        fit = np.polynomial.polynomial.polyfit(x / scale, values[rows], degree)
+        powers = np.vander(x / scale, degree + 1, increasing=True)
+        fit = np.linalg.lstsq(powers, values[rows], rcond=None)[0]
         for k in range(min(states, len(fit))):
             state[j, k] = fit[k] / scale**k
         if bent[j] and len(fit) > states:
