@@ -34,7 +34,7 @@ class Overlay:
     correlation : (w,) array
         Of the window, at that shift.
     windows : int
-        Windows tried.
+        Windows in which both runs have a channel in common.
     scatter : float
         Robust spread of the shifts about their neighbours' median, m: how well the run overlays once shifted. NaN below three windows.
     """
@@ -83,7 +83,7 @@ def overlay(geometry: Geometry, reference: Geometry, *, reach: float = 3.0) -> O
     half, pitch, most = round(0.5 * WINDOW / step), round(PITCH / step), round(reach / step)
     middles = np.arange(half + most, count - half - most, pitch)
     if not pairs or not len(middles):
-        return Overlay(np.empty(0), np.empty(0), np.empty(0), len(middles), math.nan)
+        return Overlay(np.empty(0), np.empty(0), np.empty(0), 0, math.nan)
     lags = np.arange(-most, most + 1)
     total, used = np.zeros((len(middles), len(lags))), np.zeros((len(middles), len(lags)))
     for a, b in pairs:
@@ -107,7 +107,8 @@ def overlay(geometry: Geometry, reference: Geometry, *, reach: float = 3.0) -> O
     scatter = math.nan
     if len(shift) >= 3:
         scatter = float(1.4826 * np.median(np.abs(shift - _smoothed(shift))))
-    return Overlay(geometry.distance[middles][believed], shift, peak[believed], len(middles), scatter)
+    common = int((used > 0).any(axis=1).sum())
+    return Overlay(geometry.distance[middles][believed], shift, peak[believed], common, scatter)
 
 
 def _window_correlation(a: FloatArray, b: FloatArray, middles: NDArray[np.int64], half: int) -> FloatArray:

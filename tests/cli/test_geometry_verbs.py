@@ -1,0 +1,231 @@
+"""`railnav monitor` and `railnav lining` as a user runs them: files out, figures in words, and one line for what is wrong."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from railnav.cli import main
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "monitoring"))
+from recorded import TRACK, line, recorded
+
+from railnav.io.run import write_run
+
+
+@pytest.fixture(scope="module")
+def cars(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model and two recording cars on it, as files; not to be changed."""
+    folder = tmp_path_factory.mktemp("cars")
+    line().to_file(folder / "line.gpkg")
+    write_run(recorded(1), folder / "car-1")
+    write_run(recorded(2, month=4, growing=0.4), folder / "car-2")
+    return folder
+
+
+def run(*words: object) -> tuple[int, str, str]:
+    result = CliRunner().invoke(main, [str(word) for word in words], catch_exceptions=False)
+    return result.exit_code, result.stdout, result.stderr
+
+
+def test_monitor_writes_a_page_that_asks_nothing_of_the_network(cars, tmp_path):
+    page, channels, found = tmp_path / "g.html", tmp_path / "c.parquet", tmp_path / "e.csv"
+    code, out, _ = run(
+        "monitor",
+        cars / "car-1",
+        cars / "car-2",
+        "-m",
+        cars / "line.gpkg",
+        "-o",
+        page,
+        "--channels",
+        channels,
+        "--exceedances",
+        found,
+        "--against",
+        "model",
+    )
+    assert code == 0
+    assert TRACK in out
+    html = page.read_text(encoding="utf-8")
+    for words in (
+        "Longitudinal level D1",
+        "What these runs can bear",
+        "Exceedances",
+        "Trends",
+        "recalled",
+        "strips0",
+        "Quality",
+    ):
+        assert words in html
+    assert "connect-src &#x27;none&#x27;" in html
+    with found.open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert {"gauge", "longitudinal_level_d1", "alignment_d1"} <= {row["channel"] for row in rows}
+    assert channels.stat().st_size > 100_000
+
+
+def test_monitor_in_json(cars, tmp_path):
+    code, out, _ = run(
+        "monitor",
+        cars / "car-1",
+        "-m",
+        cars / "line.gpkg",
+        "-o",
+        tmp_path / "g.html",
+        "--json",
+        "--speed",
+        100,
+        "--against",
+        "model",
+    )
+    assert code == 0
+    facts = json.loads(out)
+    assert facts["sections"][0]["speed_kmh"] == pytest.approx(100)
+    channels = facts["sections"][0]["runs"][0]["channels"]
+    assert channels["gauge"]["judged"]
+    assert facts["limits_recalled"] > 0
+    assert {e["channel"] for e in facts["sections"][0]["exceedances"]} >= {"gauge"}
+
+
+def test_default_limits_are_printed_and_read_back(cars, tmp_path):
+    code, out, _ = run("monitor", "--default-limits")
+    assert code == 0
+    table = tmp_path / "limits.toml"
+    table.write_text(out.replace("alert = [-7, 15]", "alert = [-7, 28]"), encoding="utf-8")
+    code, out, _ = run(
+        "monitor", cars / "car-1", "-m", cars / "line.gpkg", "-o", tmp_path / "g.html", "--limits", table, "--json"
+    )
+    assert code == 0
+    assert not [
+        e for e in json.loads(out)["sections"][0]["exceedances"] if e["channel"] == "gauge" and e["value_mm"] > 0
+    ]
+
+
+def test_lining_writes_a_plan_and_a_page(cars, tmp_path):
+    plan, page = tmp_path / "plan.csv", tmp_path / "plan.html"
+    code, out, _ = run("lining", cars / "car-1", cars / "car-2", "-m", cars / "line.gpkg", "-o", plan, "--report", page)
+    assert code == 0
+    assert "smoothed" in out
+    with plan.open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert float(rows[0]["slew_mm"]) == float(rows[-1]["slew_mm"]) == 0.0
+    assert min(float(row["lift_mm"]) for row in rows) >= 0.0
+    assert max(abs(float(row["slew_mm"])) for row in rows) <= 100.0
+    html = page.read_text(encoding="utf-8")
+    assert "Slew to the right, mm" in html
+    assert "Before and after" in html
+
+
+@pytest.mark.parametrize("verb", ["monitor", "lining"])
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--tracks", "77L-03"], "no run covers any of section 77L-03"),
+        (["--tracks", "nowhere"], "no track 'nowhere'"),
+        (["--tracks", "77R-01,77L-01"], "no permitted movements"),
+    ],
+)
+def test_a_section_that_the_run_does_not_cover_is_one_line(cars, tmp_path, verb, words, said):
+    output = tmp_path / ("out.html" if verb == "monitor" else "out.csv")
+    code, _, err = run(verb, cars / "car-1", "-m", cars / "line.gpkg", "-o", output, *words)
+    assert code == 1
+    assert said in err
+    assert err.count("\n") == 1
+    assert not output.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["monitor", "RUN", "-m", "MODEL", "-o", "x.pdf"], "use .html"),
+        (["monitor", "RUN", "-m", "MODEL", "-o", "x.html", "--limits", "none.toml"], "none.toml: no such file"),
+        (["monitor", "RUN", "-m", "MODEL", "-o", "x.html", "--channels", "x.txt"], "use .csv or .parquet"),
+        (["monitor", "none", "-m", "MODEL", "-o", "x.html"], "none"),
+        (["monitor", "RUN", "-m", "none.gpkg", "-o", "x.html"], "none.gpkg"),
+        (["lining", "RUN", "-m", "MODEL", "-o", "x.html"], "use .csv or .parquet"),
+        (["lining", "RUN", "-m", "MODEL", "-o", "x.csv", "--design", "none.xml"], "none.xml"),
+        (["lining", "RUN", "-m", "MODEL", "-o", "x.csv", "--fixed", "none.csv"], "none.csv"),
+    ],
+)
+def test_files_that_are_not_there_or_of_no_known_kind_are_one_line(cars, tmp_path, words, said, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    known = {"RUN": cars / "car-1", "MODEL": cars / "line.gpkg"}
+    code, _, err = run(*(known.get(word, word) for word in words))
+    assert code == 1
+    assert said in err
+    assert err.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_contradictory_fixed_points_are_named_on_one_line(cars, tmp_path):
+    fixed = tmp_path / "fixed.csv"
+    fixed.write_text(
+        f"track,offset_m,slew_mm,slew_tolerance_mm,name\n"
+        f"{TRACK},1000,0,5,bridge A\n{TRACK},1005,60,1,bridge B\n{TRACK},2000,0,5,platform\n",
+        encoding="utf-8",
+    )
+    code, _, err = run(
+        "lining", cars / "car-1", "-m", cars / "line.gpkg", "-o", tmp_path / "plan.csv", "--fixed", fixed
+    )
+    assert code == 1
+    assert "'bridge A' at 1000.0 m" in err
+    assert "'bridge B' at 1005.0 m" in err
+    assert "platform" not in err
+    assert not (tmp_path / "plan.csv").exists()
+
+
+def test_usage_that_cannot_be_meant(cars, tmp_path):
+    code, _, err = run(
+        "lining",
+        cars / "car-1",
+        "-m",
+        cars / "line.gpkg",
+        "-o",
+        tmp_path / "p.csv",
+        "--least-lift",
+        20,
+        "--most-lift",
+        10,
+    )
+    assert code == 2
+    assert "--least-lift 20 is above --most-lift 10" in err
+    same = tmp_path / "same.csv"
+    code, _, err = run(
+        "monitor",
+        cars / "car-1",
+        "-m",
+        cars / "line.gpkg",
+        "-o",
+        tmp_path / "g.html",
+        "--channels",
+        same,
+        "--exceedances",
+        same,
+    )
+    assert code == 2
+
+
+@pytest.mark.slow
+def test_a_real_line_with_gnss_alone_is_told_what_its_accuracy_allows(shared_data, tmp_path):
+    """The built model of two runs of line80, and a third run on it: long waves only, and the page says so."""
+    folder = shared_data / "line80"
+    code, _, err = run(
+        "build", folder / "2022-01-22_SU-FA_iphone", folder / "2022-01-23_FA-SU_iphone", "-o", tmp_path / "line.gpkg"
+    )
+    assert code == 0, err
+    code, out, err = run(
+        "monitor", folder / "2022-01-08_FA-SU_ublox", "-m", tmp_path / "line.gpkg", "-o", tmp_path / "g.html", "--json"
+    )
+    assert code == 0, err
+    facts = json.loads(out)
+    for part in facts["sections"]:
+        for one in part["runs"]:
+            assert not any(channel["judged"] for channel in one["channels"].values())
+            assert "GNSS positions would leave" in one["refused"]["alignment_d3"]
+    assert "No channel could be held against a limit" in (tmp_path / "g.html").read_text(encoding="utf-8")

@@ -1,0 +1,310 @@
+"""Limits from tables, exceedances against simulated defects, quality, growth and its significance."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from recorded import DEFECTS, TRACK, fields, line, recorded, solved
+
+from railnav.errors import EstimationError, InputError, OffModelError, TrackError
+from railnav.io.geometry import write_channels, write_exceedances
+from railnav.io.limits import default_limits, default_text, read_limits
+from railnav.monitoring.channels import channels_of
+from railnav.monitoring.filters import D1, band_pass
+from railnav.monitoring.limits import LEVELS, ClassLimit, deviations, exceedances, grade, segments
+from railnav.monitoring.monitor import monitor, speed_class
+from railnav.monitoring.recording import record
+from railnav.monitoring.section import onto, passages_of, section_of
+from railnav.monitoring.trends import false_discoveries, growth, trends
+
+SPEED = 120.0 / 3.6
+
+
+def geometry(seed: int, **options):
+    section = section_of(line(), [TRACK])
+    part = onto(passages_of(solved(seed, **options), line())[0], section)
+    assert part is not None
+    return channels_of(record(recorded(seed, **options), part, against_model=True))
+
+
+# --- tables ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_default_table_says_of_every_value_where_it_is_from():
+    table = default_limits()
+    for entry in (*table.limits, *table.deviations, *table.classes):
+        assert entry.status in ("read", "recalled")
+        assert entry.source
+    assert 0 < table.recalled < len(table.limits) + len(table.deviations) + len(table.classes)
+
+
+def test_the_default_table_holds_the_gauge_limits_that_were_read():
+    wide = {
+        (limit.speed[1] * 3.6): [round(1e3 * limit.levels[level][1]) for level in LEVELS]
+        for limit in default_limits().limits
+        if limit.channel == "gauge"
+    }
+    assert {round(k): v for k, v in wide.items()} == {
+        40: [20, 30, 35],
+        80: [20, 30, 35],
+        120: [15, 30, 35],
+        160: [15, 25, 35],
+        230: [12, 20, 28],
+        300: [10, 15, 28],
+    }
+
+
+def test_every_speed_up_to_300_has_exactly_one_limit_of_level_and_gauge():
+    table = default_limits()
+    for speed in np.arange(1.0, 300.5, 0.5) / 3.6:
+        for channel in ("gauge", "longitudinal_level_d1", "alignment_d1"):
+            assert sum(x.channel == channel and x.speed[0] < speed <= x.speed[1] + 1e-9 for x in table.limits) == 1
+
+
+def test_twist_limits_are_over_the_base():
+    limit = next(x for x in default_limits().limits if x.channel == "twist_9m" and x.radius[0] == 0.0)
+    assert limit.levels["immediate"] == pytest.approx((-0.034 / 9, 0.034 / 9))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda t: t + "\n[odd]\nx = 1\n", r"unknown table \[odd\]"),
+        (lambda t: t.replace("gauge_mm = 1435", 'gauge_mm = "wide"'), "gauge_mm is 'wide'"),
+        (lambda t: t.replace("alert = [-7, 20]", "alert = [7, 20]", 1), "limit 1.alert: .* is no limit"),
+        (
+            lambda t: t.replace("intervention = [-8, 30]", "intervention = [-6, 30]", 1),
+            "limit 1: intervention is milder than alert",
+        ),
+        (lambda t: t.replace('status = "read"', 'status = "heard"', 1), "status 'heard' is not known"),
+        (lambda t: t.replace("speed_kmh = [0, 40]", "speed_kmh = [40, 0]", 1), "is no range"),
+        (lambda t: t.replace("[1.25, 1.75, 2.75, 3.75]", "[1.25, 1.75, 2.75]"), "class 1: limits are"),
+        (lambda t: t.replace('channel = "twist_3m"', 'channel = "twist_m"', 1), "names no base"),
+        (lambda t: t.replace("immediate = 21", "imediate = 21"), "unknown key 'imediate'"),
+        (lambda t: t.replace("[table]", "[table", 1), "is no TOML"),
+        (lambda _: "", "holds no limit"),
+    ],
+)
+def test_a_broken_table_is_refused_by_entry(tmp_path, change, said):
+    file = tmp_path / "limits.toml"
+    file.write_text(change(default_text()), encoding="utf-8")
+    with pytest.raises(InputError, match=said) as caught:
+        read_limits(file)
+    assert "limits.toml" in str(caught.value)
+
+
+def test_an_edited_table_is_used(tmp_path):
+    file = tmp_path / "mine.toml"
+    file.write_text('[table]\nname = "mine"\n[[limit]]\nchannel = "gauge"\nalert = 3\n', encoding="utf-8")
+    table = read_limits(file)
+    assert table.limits[0].status == "own"
+    assert math.isnan(table.gauge)
+    found, verdicts = exceedances(geometry(1), table, SPEED)
+    assert {e.channel for e in found} == {"gauge"}
+    assert any(abs(e.offset - 1300.0) < 1.0 and e.value > 0.02 for e in found)
+    assert next(v for v in verdicts if v.channel == "cross_level").reason == "the table has no limit for it"
+
+
+# --- exceedances ------------------------------------------------------------------------------------------------------
+
+
+def test_every_simulated_defect_beyond_a_limit_is_reported_with_its_place():
+    found, _ = exceedances(geometry(1), default_limits(), SPEED)
+    which = line().track_index(TRACK)
+    s = np.arange(0.0, line().length(TRACK), 0.25)
+    true = {"longitudinal_level_d1": 1, "gauge": 3, "alignment_d1": 0}
+    for defect, key in zip(DEFECTS[:3], true, strict=True):
+        field = fields().at(np.full(len(s), which), s)[:, true[key]]
+        field = field if key == "gauge" else band_pass(field, 0.25, D1)
+        near = np.abs(s - defect.offset) < 5.0
+        peak = field[near][np.nanargmax(np.abs(field[near]))]
+        mine = [e for e in found if e.channel == key and abs(e.offset - defect.offset) < 5.0 and e.value * peak > 0]
+        assert len(mine) == 1, key
+        assert mine[0].track == TRACK
+        assert mine[0].value == pytest.approx(peak, abs=1e-3)
+        point = line().at(TRACK, mine[0].offset)
+        assert (mine[0].easting, mine[0].northing) == pytest.approx(
+            (float(point.easting), float(point.northing)), abs=1e-6
+        )
+        assert 0.0 < mine[0].length < defect.length + 2.0
+    assert [LEVELS.index(e.level) for e in found] == sorted((LEVELS.index(e.level) for e in found), reverse=True)
+
+
+def test_levels_follow_the_size():
+    made = geometry(1)
+    for factor, level in ((0.7, "alert"), (1.3, "intervention"), (3.0, "immediate")):
+        channel = made.channels["gauge"]
+        moved = replace(channel, values=np.full(len(channel.values), 1.435))
+        at = np.abs(made.distance - 1300.0) < 2.0
+        limit = {"alert": 0.015, "intervention": 0.030, "immediate": 0.035}[level]
+        moved.values[at] += limit + 0.002
+        found, _ = exceedances(replace(made, channels={"gauge": moved}), default_limits(), SPEED)
+        assert [e.level for e in found] == [level], factor
+
+
+def test_noisy_channels_and_uncertain_tracks_are_not_judged():
+    made = geometry(1)
+    noisy = replace(made.channels["gauge"], sigma=0.004)
+    found, verdicts = exceedances(replace(made, channels={"gauge": noisy}), default_limits(), SPEED)
+    assert not found
+    assert "over a third" in next(v for v in verdicts if v.channel == "gauge").reason
+    unknown = replace(noisy, sigma=math.nan)
+    assert not exceedances(replace(made, channels={"gauge": unknown}), default_limits(), SPEED)[0]
+    beside = replace(made, recording=replace(made.recording, passage=replace(made.recording.passage, probability=0.1)))
+    found, verdicts = exceedances(beside, default_limits(), SPEED)
+    assert not found
+    assert all(v.reason for v in verdicts)
+    assert not exceedances(made, default_limits(), 320.0 / 3.6)[0]
+
+
+def test_standard_deviations_and_classes():
+    x = np.tile([1e-3, -1e-3], 800)
+    assert deviations(x, 800) == pytest.approx([1e-3, 1e-3])
+    x[:500] = np.nan
+    assert np.isnan(deviations(x, 800)[0])
+    with pytest.raises(TrackError, match="is none"):
+        deviations(x, 1)
+    table = ClassLimit("longitudinal_level_d1", (0.0, 40.0), (0.75e-3, 1.1e-3, 1.8e-3, 2.5e-3), "read", "")
+    assert [grade(v, table) for v in (0.5e-3, 0.75e-3, 1.0e-3, 2.0e-3, 9e-3)] == ["A", "A", "B", "D", "E"]
+    made = geometry(1)
+    graded = [s for s in segments(made, default_limits(), SPEED) if s.channel == "longitudinal_level_d1"]
+    assert len(graded) > 10
+    which, offset = made.recording.passage.section.locate(made.distance)
+    truth = band_pass(fields().at(which, offset)[:, 1], 0.25, D1)
+    for s in graded:
+        mine = truth[
+            (made.distance >= s.start) & (made.distance < s.finish) & np.isfinite(made.channels[s.channel].values)
+        ]
+        assert s.deviation == pytest.approx(np.std(mine), rel=0.05)
+        assert s.grade in "ABCDE"
+
+
+# --- trends -----------------------------------------------------------------------------------------------------------
+
+
+def test_growth_rates_are_covered_by_their_sigma_and_false_findings_are_rare():
+    rng = np.random.default_rng(1)
+    months = np.array([0.0, 2.0, 5.0, 9.0])
+    squares, false, found = [], 0, 0
+    for _ in range(60):
+        rate = np.zeros(150)
+        rate[:15] = 0.08
+        made = growth(months, 1.0 + rate * months[:, None] + rng.normal(0.0, 0.1, (4, 150)))
+        squares.append(np.mean(((made.rate - rate) / made.sigma) ** 2))
+        false += made.significant[15:].sum()
+        found += made.significant[:15].sum()
+        assert made.noise == pytest.approx(0.1, rel=0.2)
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.05)
+    assert false / (false + found) < 0.07  # the share of false findings among all findings
+    assert found > 0.9 * 60 * 15
+
+
+def test_two_dates_show_what_stands_out_among_the_others():
+    rng = np.random.default_rng(2)
+    values = 1.0 + 0.02 * rng.standard_normal((2, 200))
+    values[1, 7] += 0.5
+    made = growth([0.0, 3.0], values)
+    assert made.significant[7]
+    assert made.significant.sum() <= 4
+    few = growth([0.0, 3.0], values[:, :4])
+    assert not few.significant.any()
+    assert np.isnan(few.sigma).all()
+
+
+def test_growth_needs_dates():
+    with pytest.raises(EstimationError, match="two dates"):
+        growth([1.0, 1.0], [[1.0], [2.0]])
+    with pytest.raises(EstimationError, match="do not go with"):
+        growth([0.0, 1.0], [[1.0, 2.0]])
+    missing = growth([0.0, 1.0, 2.0], [[1.0, np.nan], [2.0, np.nan], [3.1, 4.0]])
+    assert np.isnan(missing.rate[1])
+    assert not missing.significant[1]
+    assert not false_discoveries(np.array([np.nan]), 0.05).any()
+
+
+def test_a_stretch_that_gets_worse_is_found_and_the_others_are_not():
+    made = [geometry(1, month=1), geometry(2, month=4, growing=0.4), geometry(3, month=7, growing=0.8)]
+    level = next(t for t in trends(made) if t.channel == "longitudinal_level_d1")
+    assert level.months == pytest.approx([0.0, 2.96, 5.95], abs=0.05)
+    growing = (level.start + 200.0 > 2300.0) & (level.start < 2600.0)
+    assert level.growth.significant[growing].all()
+    still = np.isfinite(level.growth.rate) & ~((level.start + 240.0 > 2300.0) & (level.start < 2640.0))
+    assert level.growth.significant[still].sum() <= 1
+    assert (level.growth.rate[growing] > 0).all()
+    assert trends(made[:1]) == []
+
+
+# --- the whole --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def report():
+    runs = [recorded(1), recorded(2, month=4, growing=0.4)]
+    return monitor(runs, line(), default_limits())
+
+
+def test_monitor_lays_runs_over_one_section(report):
+    assert len(report.sections) == 1
+    part = report.sections[0]
+    assert len(part.geometries) == 2
+    assert part.overlays[0] is None
+    assert part.overlays[1].scatter < 0.05
+    assert part.speed == pytest.approx(SPEED)
+    assert {e.run for e in part.exceedances} == {"car-1", "car-2"}
+    assert part.exceedances[0].run == "car-2"  # the latest first
+
+
+def test_tables_hold_what_the_report_holds(report, tmp_path):
+    import csv
+
+    rows = write_channels(report, tmp_path / "channels.csv")
+    with (tmp_path / "channels.csv").open(encoding="utf-8") as file:
+        table = list(csv.DictReader(file))
+    assert len(table) == rows
+    assert {
+        "run",
+        "track",
+        "offset_m",
+        "gauge_mm",
+        "twist_3m_mm_m",
+        "longitudinal_level_d1_mm",
+        "curvature_1_m",
+    } <= set(table[0])
+    write_exceedances(report.sections[0].exceedances, tmp_path / "e.csv")
+    with (tmp_path / "e.csv").open(encoding="utf-8") as file:
+        listed = list(csv.DictReader(file))
+    assert len(listed) == len(report.sections[0].exceedances)
+    assert float(listed[0]["value_mm"]) == pytest.approx(1e3 * report.sections[0].exceedances[0].value, abs=0.01)
+
+
+def test_limits_for_another_gauge_are_not_applied():
+    made = monitor([recorded(1)], line(), replace(default_limits(), gauge=1.520))
+    assert not made.sections[0].exceedances
+    assert any(
+        "limits not applied: the table is for a gauge of 1520 mm, the runs show 1435 mm" in note for note in made.notes
+    )
+
+
+def test_a_run_that_does_not_cover_the_section_is_said_or_refused():
+    with pytest.raises(
+        OffModelError, match=r"no run covers any of section 77L-03 .*; they cover 77R-03 \(run 'car-1'\)"
+    ):
+        monitor([recorded(1)], line(), default_limits(), section=section_of(line(), ["77L-03"]))
+    made = monitor([recorded(1)], line(), default_limits(), section=section_of(line(), [TRACK]))
+    assert any("covers" in note and "asked for" in note for note in made.notes)
+    with pytest.raises(TrackError, match="no run"):
+        monitor([], line(), default_limits())
+
+
+def test_speed_classes():
+    assert [round(3.6 * speed_class(v / 3.6)) for v in (30.0, 79.0, 121.0, 125.0, 290.0, 400.0)] == [
+        40,
+        80,
+        120,
+        160,
+        300,
+        300,
+    ]
