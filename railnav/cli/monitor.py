@@ -74,6 +74,9 @@ def _default_limits(ctx: click.Context, _: click.Parameter, value: bool) -> None
     show_default=True,
     help="Take the model's shape off level and alignment: auto does where the model is a design.",
 )
+@click.option(
+    "--calibration", type=PATH, help="Calibration file of the IMU, .toml, for runs whose run.toml names none."
+)
 @json_option
 def command(
     runs: tuple[Path, ...],
@@ -88,6 +91,7 @@ def command(
     bases: tuple[float, ...],
     step: float,
     against: str,
+    calibration: Path | None,
     as_json: bool,
 ) -> None:
     """Work out track geometry channels from runs on a model, and hold them against limits.
@@ -114,6 +118,7 @@ def command(
             ]:
                 raise click.UsageError(f"{extra} is named twice")
     _files.need_report()
+    from railnav.io.imu_calibration import calibrated_run
     from railnav.io.limits import default_limits, read_limits
     from railnav.io.run import read_run
     from railnav.monitoring.monitor import monitor
@@ -125,7 +130,7 @@ def command(
     section = section_of(reference, names) if tracks is not None else None
     with progress() as tell:
         report = monitor(
-            [read_run(run) for run in runs],
+            [calibrated_run(read_run(run), calibration) for run in runs],
             reference,
             table,
             section=section,

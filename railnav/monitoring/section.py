@@ -224,7 +224,9 @@ def passages_of(solution: Solution, model: TrackModel) -> list[Passage]:
         if states and state == states[-1]:
             via = []
         elif states and all(track != t for t, _ in states):
-            ahead = float(np.nanmax(np.abs(solution.speed[[rows[-1], a]]))) * (solution.time[a] - solution.time[rows[-1]])
+            ahead = float(np.nanmax(np.abs(solution.speed[[rows[-1], a]]))) * (
+                solution.time[a] - solution.time[rows[-1]]
+            )
             via = _between(model, onward, states[-1], state, ahead + SLACK)
             if via is not None and any(t == passed for t, _ in via for passed, _ in states):
                 via = None
