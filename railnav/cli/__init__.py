@@ -25,7 +25,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "diff": ("diff", "Compare two models: where the track moved, by how much, and how sure that is."),
     "navigate": ("navigate", "Place a run on a model: track, offset, speed, and how sure that is."),
     "evaluate": ("evaluate", "Compare a solution with the truth: errors along and across, track selection, integrity."),
-    "monitor": ("monitor", "Work out track geometry channels from runs, and hold them against limits."),
+    "monitor": ("monitor", "Work out track geometry channels from runs on a model, and hold them against limits."),
     "lining": ("lining", "Plan slews and lifts from the measured track to its design or a smoothed target."),
     "calibrate": (
         "calibrate",
