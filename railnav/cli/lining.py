@@ -76,7 +76,7 @@ def command(
     curvature_rate: float,
     as_json: bool,
 ) -> None:
-    """Plan slews and lifts from the track as measured to its design, or to a smoothed target.
+    """Plan slews and lifts from the measured track to its design or a smoothed target.
 
     The track is measured by the RUNs' positions and angles where they are good enough, otherwise the model's own axis is taken; the plan
     says which, and how good it is. Slews are to the right as the distance grows. Fixed points, the greatest slew, lifts that only lift
