@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,9 @@ from railnav.io.container import bounds_of, create, opened, point_blobs
 from railnav.io.qgis_styles import add_styles
 from railnav.io.tables import PARQUET_ENDINGS, Column, Table, Words, check_table, freeze, read_table, write_table
 from railnav.navigation.solution import Alternatives, Mode, Solution
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -179,6 +182,31 @@ def read_solution(path: str | Path) -> Solution:
         table = read_table(path, columns)
     check_table(table, columns)
     return _solution(table, others)
+
+
+def solution_table(solution: Solution) -> pa.Table:
+    """A solution as an Arrow table: the columns of a solution file and a "geometry" of points in the model's plane.
+
+    Parameters
+    ----------
+    solution : Solution
+        What to give.
+
+    Returns
+    -------
+    pyarrow.Table
+        Angles in degrees, chainage in km, as the names say; null where a row has no position.
+    """
+    import pyarrow as pa
+
+    from railnav.io.tables import _arrow
+    from railnav.track.tables import geometry_column, points
+
+    arrays = {name: _arrow(column, None) for name, column in _columns(solution).items()}
+    shapes = points(solution.easting, solution.northing, solution.ellipsoidal_height)
+    field, geometry = geometry_column(shapes, solution.crs_wkt)
+    fields = [pa.field(name, array.type) for name, array in arrays.items()]
+    return pa.Table.from_arrays([*arrays.values(), geometry], schema=pa.schema([*fields, field]))
 
 
 # --- columns ----------------------------------------------------------------------------------------------------------

@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import geopandas
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -146,6 +149,19 @@ class Solution:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def to_geodataframe(self) -> geopandas.GeoDataFrame:
+        """The rows as a GeoDataFrame of points in the model's plane (extra "frames"), columns as in a solution file."""
+        from railnav.io.solution import solution_table  # a door upward, named in the import contract
+        from railnav.track.tables import frame_of
+
+        return frame_of(solution_table(self))
+
+    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
+        """Arrow's PyCapsule protocol: `pyarrow.table(solution)`, `polars.from_arrow(solution)` and the like."""
+        from railnav.io.solution import solution_table  # a door upward, named in the import contract
+
+        return solution_table(self).__arrow_c_stream__(requested_schema)
 
     def to_file(self, path: str | Path) -> None:
         """Write .csv, .parquet, .gpkg or .geojson by the ending; see `railnav.io.solution.write_solution`."""

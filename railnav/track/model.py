@@ -23,6 +23,7 @@ from railnav.track.index import SpatialIndex, index_tracks
 from railnav.units import wrap_angle
 
 if TYPE_CHECKING:
+    import geopandas
     import networkx as nx
 
     from railnav.track.records import ModelRecords, RecordSource
@@ -271,6 +272,24 @@ class TrackModel:
         Read from the file when asked for, not before.
         """
         return None if self.record_source is None else self.record_source()
+
+    def to_geodataframe(self, layer: str = "tracks") -> geopandas.GeoDataFrame:
+        """One layer of the model as a GeoDataFrame in its plane (extra "frames"); see `railnav.track.tables.model_table`.
+
+        Parameters
+        ----------
+        layer : {"tracks", "knots", "nodes", "mileposts", "movements"}
+            "movements" has no geometry and is a plain DataFrame.
+        """
+        from railnav.track.tables import frame_of, model_table
+
+        return frame_of(model_table(self, layer))  # type: ignore[arg-type]  # an unknown layer is refused there
+
+    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
+        """Arrow's PyCapsule protocol, one row a knot: `pyarrow.table(model)`, `polars.from_arrow(model)` and the like."""
+        from railnav.track.tables import model_table
+
+        return model_table(self, "knots").__arrow_c_stream__(requested_schema)
 
     @property
     def index(self) -> SpatialIndex:
