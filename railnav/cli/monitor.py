@@ -94,7 +94,7 @@ def command(
     calibration: Path | None,
     as_json: bool,
 ) -> None:
-    """Work out track geometry channels from runs, and hold them against limits.
+    """Work out track geometry channels from runs on a model, and hold them against limits.
 
     Longitudinal level and alignment in D1, D2 and D3, cross level, twist, gauge and curvature, each from the streams that a RUN has; the
     page says which bands its sensors can bear and which not. Several runs are laid over each other to the decimetre or better; runs of
