@@ -1,9 +1,10 @@
 """How fast GNSS logs are read, and in how much memory: NMEA lines, .pos rows and UBX messages a second.
 
-python benchmarks/logs.py [--json] [--peers] [--hours 24]
+python benchmarks/logs.py [--json] [--peers] [--hours 24] [--stream]
 
 Logs of a receiver at 10 Hz are written to a temporary folder and read in a fresh process each, three times: the first reading
 loads the compiled parser. Beside the wall clock stands CPU time, for machines that others use too.
+`--stream` turns logs of two sizes into a run folder, piece by piece, and prints the peak memory of each: it must not grow with the log.
 `--peers` reads a piece of them with pynmeagps and pyubx2, which parse every field of every message.
 """
 
@@ -22,6 +23,7 @@ import time
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 START = datetime(2025, 7, 8, tzinfo=UTC)
 #: What issue 6 asks for, units a second.
@@ -133,6 +135,36 @@ def read(name: str, path: str) -> None:
     )
 
 
+def convert(path: str, output: str) -> None:
+    """Turn a log into a run folder in this process, and print the time and the peak memory."""
+    import resource
+
+    from railnav.io.logs import convert_log
+
+    began = time.process_time()
+    fixes, _ = convert_log(path, output)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(json.dumps({"cpu_s": round(time.process_time() - began, 2), "peak_mb": round(peak), "fixes": fixes}))
+
+
+def stream(hours: float) -> dict[str, Any]:
+    """Peak memory of converting an NMEA log of `hours`, and one ten times as long."""
+    figures: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for factor in (1, 10):
+            path = Path(folder, f"log{factor}.nmea")
+            with path.open("wb") as file:
+                for _, data in parts("nmea", round(hours * factor * 3600 * RATE)):
+                    file.write(data)
+            command = [sys.executable, __file__, "--convert", str(path), str(Path(folder, f"run{factor}"))]
+            got = json.loads(
+                subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1]
+            )
+            figures[f"{path.stat().st_size / 1e6:.0f} MB"] = got
+            path.unlink()
+    return figures
+
+
 def peer(name: str, path: Path) -> float | None:
     """Units a second of the usual Python reader, over the first 2 MB."""
     import io
@@ -155,10 +187,24 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--peers", action="store_true")
     parser.add_argument("--hours", type=float, default=6.0)
+    parser.add_argument("--stream", action="store_true")
     parser.add_argument("--read", nargs=2, help=argparse.SUPPRESS)
+    parser.add_argument("--convert", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.read:
         read(*options.read)
+        return
+    if options.convert:
+        convert(*options.convert)
+        return
+    if options.stream:
+        streamed = stream(options.hours)
+        if options.json:
+            print(json.dumps({"benchmark": "logs, streamed", "figures": streamed}, indent=2))
+        for size, got in () if options.json else streamed.items():
+            print(
+                f"nmea of {size} into a run folder: {got['fixes']:,} fixes, {got['cpu_s']} s of CPU, peak {got['peak_mb']} MB"
+            )
         return
     figures = {}
     with tempfile.TemporaryDirectory() as folder:

@@ -185,6 +185,12 @@ PAGES = {
                 "Lines, rows and messages a second of simulated logs.",
                 "python benchmarks/logs.py",
             ),
+            Section(
+                "logs-streamed",
+                "Logs turned into a run folder piece by piece",
+                "Memory must not grow with the log: one of ten times the size needs no more.",
+                "python benchmarks/logs.py --stream --hours 5",
+            ),
         ),
     ),
 }

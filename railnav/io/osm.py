@@ -42,6 +42,8 @@ CALM = 0.15
 DOUBLES_BACK = math.radians(100.0)
 #: A train passes a drawn node when it turns by less than this, rad: tight curves are drawn with few vertices.
 LARGEST_TURN = math.radians(60.0)
+#: Movements that turn by more than this at their node are counted, rad.
+SAID_TURN = math.radians(0.5)
 #: Mile posts are laid on tracks of their line this near, m.
 POST_REACH = 12.0
 #: A post whose chainage disagrees with the others of its track by more than this is passed over, m.
@@ -191,6 +193,12 @@ def read_osm(
     movements = np.array([(a // 2, a % 2, b // 2, b % 2) for a, b in junctions.permitted], np.int64).reshape(-1, 4)
     tell("mile posts", 3)
     posts = _mileposts(model, found)
+    corners = _corners(model, movements)
+    if corners["slips"] or corners["others"]:
+        notes.append(
+            f"{corners['slips']} movements over slips drawn as a point and {corners['others']} others turn by more than half a degree "
+            "at their node: no curve of 15 m within 0.3 m of the drawing meets them"
+        )
     apart = _crossings_without_node(chains, lines, ways, frame)
     notes += apart
     told = {
@@ -200,6 +208,7 @@ def read_osm(
         "ways": len(found.ways),
         "switches": sum(tags.get("railway") == "switch" for tags in found.tags.values()),
         "junctions": junctions.told,
+        "corners": corners,
         "ways_that_cross_without_a_node": len(apart),
         "mileposts": posts.told,
         "electrified_km": _kilometres(found, known, grid, "electrified"),
@@ -579,6 +588,18 @@ def _kinds(model: TrackModel, chains: Sequence[_Chain], tags: dict[int, dict[str
             if degree[number] == 1 and tags.get(node, {}).get("railway") == "buffer_stop":
                 kind[number] = NodeKind.BUFFER_STOP
     return kind
+
+
+def _corners(model: TrackModel, movements: IntArray) -> dict[str, int]:
+    """Movements whose direction still turns at the node, over slips and elsewhere."""
+    ends = np.stack([model.knot_start[:-1], model.knot_start[1:] - 1])
+    bearing = model.grid_bearing[ends] + np.array([[math.pi], [0.0]])  # of a train that leaves by this end
+    leave = bearing[movements[:, 1], movements[:, 0]]
+    enter = bearing[movements[:, 3], movements[:, 2]] + math.pi
+    turned = np.abs(wrap_angle(enter - leave)) > SAID_TURN
+    node = np.where(movements[:, 1] == 1, model.end_node[movements[:, 0]], model.start_node[movements[:, 0]])
+    degree = np.bincount(np.concatenate([model.start_node, model.end_node]), minlength=len(model.nodes.id))[node]
+    return {"slips": int((turned & (degree > 3)).sum()), "others": int((turned & (degree <= 3)).sum())}
 
 
 def _crossings_without_node(

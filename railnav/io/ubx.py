@@ -44,8 +44,8 @@ def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> 
 
     References
     ----------
-    u-blox F9 HPG 1.32 interface description, UBX-22008968: frame 3.2, checksum 3.4, NAV-PVT 3.15.13, NAV-COV 3.15.2,
-    NAV-HPPOSLLH 3.15.9, NAV-DOP 3.15.4.
+    u-blox F9 HPG interface description: frame and checksum, NAV-PVT (0x01 0x07), NAV-COV (0x01 0x36), NAV-HPPOSLLH (0x01 0x14), NAV-DOP
+    (0x01 0x04). Layouts and scales are those that pyubx2 knows by these names; the tests hold both against each other.
     """
     count = np.zeros(_kernels.UBX_COUNTERS, dtype=np.int64)
     kinds = np.zeros(1 << 16, dtype=np.int64)
