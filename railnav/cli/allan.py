@@ -94,32 +94,35 @@ def command(
         return
     print_table(
         f"{found.logs[0].name}: noise from {curves['gyro x'].duration:.0f} s at {1.0 / noise.interval:.0f} Hz",
-        ("channel", "random walk", "", "bias instability", "", "rate random walk", "", "misfit"),
-        [_row(name, fit) for name, fit in fits.items()],
+        ("channel", *(cell for term in wanted for cell in (term.replace("_", " "), "")), "misfit"),
+        [_row(name, fit, wanted) for name, fit in fits.items()],
     )
     if output is not None:
         click.echo(f"{output} written")
 
 
-def _row(name: str, fit: Any) -> tuple[str, ...]:
-    """One channel in the units of data sheets."""
+def _row(name: str, fit: Any, terms: tuple[str, ...]) -> tuple[str, ...]:
+    """One channel in the units of data sheets; what does not stand out of its sigma is left empty."""
     from math import degrees
 
     gyro = name.startswith("gyro")
-    parts = (
-        ("random_walk", degrees(1.0) * 60.0 if gyro else 60.0, "deg/sqrt(h)" if gyro else "m/s/sqrt(h)"),
-        ("bias_instability", degrees(1.0) * 3600.0 if gyro else 1e3 / 9.80665, "deg/h" if gyro else "mg"),
-        (
-            "rate_random_walk",
-            degrees(1.0) * 3600.0 * 60.0 if gyro else 60e3 / 9.80665,
-            "deg/h/sqrt(h)" if gyro else "mg/sqrt(h)",
-        ),
-    )
-    cells = []
-    for term, scale, unit in parts:
-        value = getattr(fit, term)
-        sigma = fit.sigma.get(term)
+    hour, milli = degrees(1.0) * 3600.0, 1e3 / 9.80665
+    units = {
+        "quantisation": (hour, "arc seconds") if gyro else (1e3, "mm/s"),
+        "random_walk": (degrees(1.0) * 60.0, "deg/sqrt(h)") if gyro else (60.0, "m/s/sqrt(h)"),
+        "bias_instability": (hour, "deg/h") if gyro else (milli, "mg"),
+        "gauss_markov": (hour, f"deg/h, {fit.correlation_time:.3g} s")
+        if gyro
+        else (milli, f"mg, {fit.correlation_time:.3g} s"),
+        "rate_random_walk": (hour * 60.0, "deg/h/sqrt(h)") if gyro else (milli * 60.0, "mg/sqrt(h)"),
+        "ramp": (hour * 3600.0, "deg/h/h") if gyro else (milli * 3600.0, "mg/h"),
+    }
+    cells: list[str] = []
+    for term in terms:
+        value, sigma, (scale, unit) = getattr(fit, term), fit.sigma.get(term), units[term]
         cells += (
-            [f"{value * scale:.3g} +- {sigma * scale:.1g}", unit] if sigma is not None and value > 4.0 * sigma else ["", ""]
+            [f"{value * scale:.3g} +- {sigma * scale:.1g}", unit]
+            if sigma is not None and value > 4.0 * sigma
+            else ["", ""]
         )
     return (name, *cells, f"{fit.misfit:.2f}")
