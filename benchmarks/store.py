@@ -1,6 +1,6 @@
 """Store of a reference track model: size, time and memory for 1,000 km at 1 m knots.
 
-Run `python benchmarks/store.py [--km 1000] [--tracks 100] [--json PATH]`. Writing and reading run in processes of their own,
+Run `python benchmarks/store.py [--km 1000] [--tracks 100] [--postgis] [--json PATH]`. Writing and reading run in processes of their own,
 so that the peak of memory is theirs alone. The model is synthetic: every column holds digits of its own, as surveyed track
 does, so nothing shrinks to one value but the cant of straight track.
 """
@@ -8,6 +8,7 @@ does, so nothing shrinks to one value but the cant of straight track.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import resource
 import subprocess
@@ -76,7 +77,7 @@ def peak_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def _child(task: str, path: Path, km: float, tracks: int) -> dict[str, float]:
+def _child(task: str, path: Path | str, km: float, tracks: int) -> dict[str, float]:
     if task == "write":
         model = synthetic_model(km, tracks)
         before = peak_mb()
@@ -122,16 +123,40 @@ def measure(km: float, tracks: int) -> dict[str, float]:
     return result
 
 
+def measure_postgis(km: float, tracks: int) -> dict[str, float | str]:
+    """The same in a PostGIS store, by the server that the tests start."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "io"))
+    from postgres_server import NoServer, running_server
+
+    result: dict[str, float | str] = {"postgis_note": "fsync off, as the tests run it"}
+    with contextlib.ExitStack() as stack:
+        try:
+            server = stack.enter_context(running_server())
+        except NoServer as why:
+            return {"postgis_note": str(why)}
+        for task in ("write", "read"):
+            command = [sys.executable, __file__, "--task", task, "--address", f"{server}?model=bench"]
+            command += ["--km", str(km), "--tracks", str(tracks)]
+            done = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout)
+            result |= {f"postgis_{key}": value for key, value in done.items()}
+    return result
+
+
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--km", type=float, default=1000.0)
     parser.add_argument("--tracks", type=int, default=100)
+    parser.add_argument(
+        "--postgis", action="store_true", help="also in a PostGIS store, by a server that is started for it"
+    )
+    parser.add_argument("--address", help=argparse.SUPPRESS)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--task", choices=("write", "read"), help=argparse.SUPPRESS)
     parser.add_argument("--path", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.task:
-        print(json.dumps(_child(options.task, options.path, options.km, options.tracks)))
+        where = options.address or options.path
+        print(json.dumps(_child(options.task, where, options.km, options.tracks)))
         return
     result = measure(options.km, options.tracks)
     print(f"{result['knots']:,.0f} knots on {result['tracks']:.0f} tracks")
@@ -141,6 +166,14 @@ def main(arguments: list[str] | None = None) -> None:
         f"memory  {result['peak_mb']:8.0f} MB   (goal 400; of the process, {result['imports_mb']:.0f} of it libraries)"
     )
     print(f"write   {result['write_s']:8.2f} s    ({result['write_extra_mb']:.0f} MB more than the model)")
+    if options.postgis:
+        result |= measure_postgis(options.km, options.tracks)
+        print(f"PostGIS, a server of its own on the loopback ({result['postgis_note']})")
+        print(
+            f"load    {result['postgis_load_s']:8.2f} s    (goal 5; GeoPackage {result['load_s']:.2f} s in the same run)"
+        )
+        print(f"memory  {result['postgis_peak_mb']:8.0f} MB   (of the reading process)")
+        print(f"write   {result['postgis_write_s']:8.2f} s    (one version)")
     if options.json:
         options.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
 

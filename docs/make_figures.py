@@ -48,6 +48,13 @@ PAGES = {
                 real_data=True,
             ),
             Section(
+                "corridor",
+                "Planes for trunk lines",
+                "What planes make of a metre along whole lines: Gauss-Krueger with a change of zone at each boundary, one fitted oblique "
+                "Mercator, sections of 200 km. The lines are rough, towns joined by geodesics.",
+                "python benchmarks/corridor.py",
+            ),
+            Section(
                 "survey-simulated",
                 "Simulated survey: 2 cm GNSS, three passes over a double line",
                 "The model's axis and length against the truth, and whether its stated covariance holds (NEES per knot is 1 when it "
@@ -155,8 +162,8 @@ PAGES = {
             Section(
                 "store",
                 "The model store",
-                "A synthetic network of 1,000 km at 1 m knots, written and read in processes of their own.",
-                "python benchmarks/store.py",
+                "A synthetic network of 1,000 km at 1 m knots, written and read in processes of their own; the same in a PostGIS store.",
+                "python benchmarks/store.py --postgis",
             ),
             Section(
                 "build",
