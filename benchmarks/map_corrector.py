@@ -165,7 +165,14 @@ CASES: tuple[tuple[str, str, dict[str, Any], dict[str, Any], tuple[float, ...] |
     ("literal (10)-(12), window 50 m", "literal", {}, {}, (27.1, 3.5, 9.5, 1762)),
     ("literal, window 9 m", "literal", {"window": 9.0}, {}, (6.2, 0.45, 4.5, 1290)),
     ("literal, map step 0.05 m", "literal", {}, {"step": 0.05}, (26.5, 3.4, 8.8, 1448)),
-    ("literal + half interval", "literal_half_interval", {}, {}, (21.4, 2.4, 4.1, 995)),
+    (
+        "+ half interval, 0.05 m, first order",
+        "literal_half_interval",
+        {"first_order": True},
+        {"step": 0.05},
+        (21.4, 2.4, 4.1, 995),
+    ),
+    ("+ half interval, 0.05 m, exponential", "literal_half_interval", {}, {"step": 0.05}, None),
     ("GNSS candidate always", "gnss", {}, {}, (4.6, 0.42, 4.1, 624)),
     ("arc length (0.15, 0.012)", "arc", {}, {}, (1.12, 0.03, 0.096, 24.8)),
     ("arc length, 15 m chords", "arc", {}, {"chord": 15.0}, (1.09, 0.19, 0.096, 81)),
@@ -188,7 +195,7 @@ def main(arguments: list[str] | None = None) -> None:
         runs = np.array([trial(seed, corrector, way, **dict(settings)) for seed in range(options.trials)])
         mean = np.sqrt((runs**2).mean(axis=0))
         told = "" if own is None else "   " + " ".join(f"{v:g}" for v in own)
-        print(f"  {name:34}{mean[0]:8.2f}{mean[1]:8.2f}{mean[2]:8.3f}{mean[3]:9.1f}{runs[:, 4].mean():6.2f}{told}")
+        print(f"  {name:38}{mean[0]:8.2f}{mean[1]:8.2f}{mean[2]:8.3f}{mean[3]:9.1f}{runs[:, 4].mean():6.2f}{told}")
         result[name] = dict(
             zip(
                 ("along_m", "across_m", "speed_m_s", "heading_arcmin", "ins_chosen", "total_after_10_s_m"),

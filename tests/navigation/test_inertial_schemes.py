@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from railnav.errors import RunError
+from railnav.errors import EstimationError, RunError
 from railnav.geodesy.ellipsoid import WGS84
 from railnav.inertial.aided import Ranges
 from railnav.navigation import Mode
@@ -207,6 +207,72 @@ def test_tight_needs_ranges_and_takes_three_satellites(drive):
 def test_refusals_say_what_would_work(drive, change, options, words):
     with pytest.raises(RunError, match=words):
         navigate_inertial(change(as_run(drive, 1)), **options)
+
+
+@pytest.mark.parametrize(
+    ("turn", "words"),
+    [
+        (lambda i: replace(i, gyro=np.degrees(i.gyro)), "divide the rates by 57.3"),
+        (lambda i: replace(i, specific_force=i.specific_force / 9.80665), "if they are in g"),
+        (lambda i: replace(i, gyro=i.gyro * [1, 1, -1]), "reads -1.0"),
+        (
+            lambda i: replace(
+                i, gyro=i.gyro[:, [1, 0, 2]] * [1, -1, 1], specific_force=i.specific_force[:, [1, 0, 2]] * [1, -1, 1]
+            ),
+            "90 degrees",
+        ),
+    ],
+)
+def test_wrong_units_and_axes_are_recognised(drive, turn, words):
+    run = as_run(drive, 1)
+    for scheme in ("loose", "odometer"):
+        with pytest.raises(RunError, match=words):
+            navigate_inertial(replace(run, imu=turn(run.imu)), scheme=scheme)
+
+
+def test_an_imu_upside_down_is_turned_over_and_said(drive):
+    run = as_run(drive, 1)
+    flip = np.array([1.0, -1.0, -1.0])
+    over = replace(run, imu=replace(run.imu, gyro=run.imu.gyro * flip, specific_force=run.imu.specific_force * flip))
+    solution = navigate_inertial(over, scheme="odometer")
+    assert abs(solution.diagnostics["levelled_roll_deg"]) == pytest.approx(180.0, abs=3.0)
+    _, along, across, *_ = errors(drive, solution)
+    assert np.hypot(along, across).max() < 6.0
+
+
+def test_streams_that_contradict_each_other_are_refused(drive):
+    run = as_run(drive, 1)
+    late = replace(run, gnss=replace(run.gnss, time=run.gnss.time + 6.0))
+    with pytest.raises((RunError, EstimationError)):
+        navigate_inertial(late, scheme="odometer")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda g: replace(g, height=None, sigma_up=None),
+        lambda g: replace(g, sigma_east=None, sigma_north=None, sigma_up=None, sigma_speed=None),
+        lambda g: replace(g, course=np.where(g.speed < 0.5, np.nan, g.course)),
+        lambda g: replace(g, latitude=g.latitude + np.where(np.arange(len(g)) % 40 == 20, 2e-5, 0.0)),
+    ],
+)
+def test_poorer_receivers_will_do(drive, change):
+    run = as_run(drive, 1)
+    _, along, across, a, b = errors(drive, navigate_inertial(replace(run, gnss=change(run.gnss)), scheme="odometer"))
+    assert np.hypot(along, across).max() < 6.0
+    assert max(np.mean(a**2), np.mean(b**2)) < 1.6
+
+
+def test_a_log_that_starts_in_motion(drive):
+    run = as_run(drive, 1)
+    cut = replace(
+        run,
+        imu=replace(
+            run.imu, time=run.imu.time[2000:], gyro=run.imu.gyro[2000:], specific_force=run.imu.specific_force[2000:]
+        ),
+    )
+    _, along, across, *_ = errors(drive, navigate_inertial(cut))
+    assert np.hypot(along, across).max() < 6.0
 
 
 def test_a_hole_in_the_imu_is_refused(drive):

@@ -132,7 +132,7 @@ def test_TV11_velocities_and_slope_of_the_literal_rule():
     out = map_constrained(
         start, np.arange(1, 11) * 0.1, *still, [1.0], e[1:], way, start_time=0.0, corrector="gnss", gravity=SOURCE
     )
-    # standing before, the half-interval term adds nothing to the mean velocity of the jump
+    # the velocity of the jump
     np.testing.assert_allclose(out.trajectory.velocity_n[-1], [12.758828, 5.397043, -0.4], atol=2e-4)
     assert out.trajectory.euler()[1][-1] / DEGREE == pytest.approx(1.653890, abs=1e-4)
 

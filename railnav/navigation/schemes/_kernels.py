@@ -153,7 +153,7 @@ def map_kernel(
                 vn = (latitude - before[0]) / since * meridian  # (11)
                 ve = (longitude - before[1]) / since * across
                 vh = (height - before[2]) / since
-                if policy != LITERAL:  # what the mean of the interval lags behind its end
+                if policy == LITERAL_HALF:  # what the mean of the interval lags behind its end
                     vn += state[3] - (state[0] - before[0]) / since * meridian
                     ve += state[4] - (state[1] - before[1]) / since * across
                     vh += -state[5] - (state[2] - before[2]) / since
