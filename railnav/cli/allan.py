@@ -95,13 +95,13 @@ def command(
     print_table(
         f"{found.logs[0].name}: noise from {curves['gyro x'].duration:.0f} s at {1.0 / noise.interval:.0f} Hz",
         ("channel", *(cell for term in wanted for cell in (term.replace("_", " "), "")), "misfit"),
-        [_row(name, fit, wanted) for name, fit in fits.items()],
+        [_row(name, fit, wanted, curves[name].time) for name, fit in fits.items()],
     )
     if output is not None:
         click.echo(f"{output} written")
 
 
-def _row(name: str, fit: Any, terms: tuple[str, ...]) -> tuple[str, ...]:
+def _row(name: str, fit: Any, terms: tuple[str, ...], time: Any) -> tuple[str, ...]:
     """One channel in the units of data sheets; what does not stand out of its sigma is left empty."""
     from math import degrees
 
@@ -119,10 +119,7 @@ def _row(name: str, fit: Any, terms: tuple[str, ...]) -> tuple[str, ...]:
     }
     cells: list[str] = []
     for term in terms:
-        value, sigma, (scale, unit) = getattr(fit, term), fit.sigma.get(term), units[term]
-        cells += (
-            [f"{value * scale:.3g} +- {sigma * scale:.1g}", unit]
-            if sigma is not None and value > 4.0 * sigma
-            else ["", ""]
-        )
+        scale, unit = units[term]
+        found = fit.stands_out(term, time)
+        cells += [f"{getattr(fit, term) * scale:.3g} +- {fit.sigma[term] * scale:.1g}", unit] if found else ["", ""]
     return (name, *cells, f"{fit.misfit:.2f}")

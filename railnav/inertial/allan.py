@@ -78,6 +78,37 @@ class NoiseParameters:
     sigma: dict[str, float]
     misfit: float
 
+    def parts(self, time: ArrayLike) -> dict[str, FloatArray]:
+        """Allan variance that each part makes at averaging times, (k,) s -> (k,), unit^2, by the names of `TERMS`.
+
+        Examples
+        --------
+        >>> NoiseParameters(2.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, {}, 0.0).parts([4.0])["random_walk"]
+        array([1.])
+        """
+        tau = np.asarray(time, dtype=np.float64)
+        slow = _markov(tau, self.correlation_time) if self.gauss_markov > 0.0 else np.zeros_like(tau)
+        return {
+            "quantisation": 3.0 * self.quantisation**2 / tau**2,
+            "random_walk": self.random_walk**2 / tau,
+            "bias_instability": np.full_like(tau, 2.0 * math.log(2.0) / math.pi * self.bias_instability**2),
+            "gauss_markov": self.gauss_markov**2 * slow,
+            "rate_random_walk": self.rate_random_walk**2 * tau / 3.0,
+            "ramp": self.ramp**2 * tau**2 / 2.0,
+        }
+
+    def deviation(self, time: ArrayLike) -> FloatArray:
+        """Allan deviation of all parts together, (k,) s -> (k,), unit."""
+        return np.asarray(np.sqrt(sum(self.parts(time).values())))
+
+    def stands_out(self, term: str, time: ArrayLike) -> bool:
+        """Whether a part was found for good: above four of its sigmas, and a tenth of the variance or more somewhere among the times."""
+        sigma = self.sigma.get(term)
+        if sigma is None or not getattr(self, term) > 4.0 * sigma:
+            return False
+        share = self.parts(time)[term] / self.deviation(time) ** 2
+        return bool(share.max() > 0.1)
+
 
 def allan_deviation(values: ArrayLike, interval: float, *, points_per_octave: int = 2) -> AllanCurve:
     """Overlapping Allan deviation of evenly spaced samples of a sensor at rest.

@@ -6,9 +6,6 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
 from railnav.errors import RailnavError
 from railnav.web.figures import INK, PALETTE
 
@@ -17,22 +14,8 @@ if TYPE_CHECKING:
 
     from railnav.inertial.allan import AllanCurve, NoiseParameters
 
-FloatArray = NDArray[np.float64]
-
 #: Panels: channels whose names begin so, factor to the unit drawn, its name.
 _PANELS = (("gyro", math.degrees(1.0) * 3600.0, "deg/h"), ("accelerometer", 1e3 / 9.80665, "mg"))
-
-
-def fitted(fit: NoiseParameters, tau: FloatArray) -> FloatArray:
-    """Allan deviation that the fitted parts make, (k,) s -> (k,)."""
-    square = fit.random_walk**2 / tau + (2.0 * math.log(2.0) / math.pi) * fit.bias_instability**2
-    square = (
-        square + fit.rate_random_walk**2 * tau / 3.0 + 3.0 * fit.quantisation**2 / tau**2 + fit.ramp**2 * tau**2 / 2.0
-    )
-    if fit.gauss_markov > 0.0:
-        x = tau / fit.correlation_time
-        square = square + fit.gauss_markov**2 * (2.0 * x - 3.0 + 4.0 * np.exp(-x) - np.exp(-2.0 * x)) / x**2
-    return np.asarray(np.sqrt(square))
 
 
 def allan_picture(curves: Mapping[str, AllanCurve], fits: Mapping[str, NoiseParameters], *, title: str = "") -> Figure:
@@ -72,7 +55,7 @@ def allan_picture(curves: Mapping[str, AllanCurve], fits: Mapping[str, NoisePara
                 alpha=0.15,
                 linewidth=0,
             )
-            axes.loglog(curve.time, factor * fitted(fits[name], curve.time), color=colour, linewidth=1.2)
+            axes.loglog(curve.time, factor * fits[name].deviation(curve.time), color=colour, linewidth=1.2)
         axes.set_xlabel("averaging time, s")
         axes.set_ylabel(f"Allan deviation, {unit}")
         axes.set_title(f"{kind}s: points measured, lines fitted", loc="left", fontsize=10, color=INK)
@@ -115,7 +98,7 @@ def allan_page(curves: Mapping[str, AllanCurve], fits: Mapping[str, NoiseParamet
             figure.add_trace(
                 go.Scatter(
                     x=curve.time,
-                    y=factor * fitted(fits[name], curve.time),
+                    y=factor * fits[name].deviation(curve.time),
                     mode="lines",
                     line={"color": PALETTE[k]},
                     name=f"{name}, fitted",

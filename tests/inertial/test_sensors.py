@@ -166,3 +166,19 @@ def test_stated_sigma_is_honest():
 def test_refusals_say_why(call, error, words):
     with pytest.raises(error, match=words):
         call()
+
+
+def test_parts_make_the_curve_and_only_real_ones_stand_out():
+    x = np.random.default_rng(5).normal(0.0, 1.0, 200_000)
+    x += np.random.default_rng(6).normal(0.0, 2e-3, 200_000).cumsum()
+    curve = allan_deviation(x, 0.01)
+    fit = fit_allan(curve)
+    np.testing.assert_allclose(fit.deviation(curve.time), curve.deviation, rtol=0.35)
+    assert sum(fit.parts(curve.time).values()) == pytest.approx(fit.deviation(curve.time) ** 2)
+    assert fit.stands_out("random_walk", curve.time)
+    assert fit.stands_out("rate_random_walk", curve.time) or fit.stands_out("bias_instability", curve.time)
+    for seed in range(6):
+        white = allan_deviation(np.random.default_rng(seed).normal(0.0, 1.0, 50_000), 0.01)
+        found = fit_allan(white, terms=("random_walk", "gauss_markov"))
+        assert found.stands_out("random_walk", white.time)
+        assert not found.stands_out("gauss_markov", white.time)
