@@ -8,7 +8,8 @@ import pytest
 from railnav.attitude import dcm_from_euler, quaternion_from_dcm
 from railnav.estimation.square_root import predict, update
 from railnav.geodesy import WGS84
-from railnav.inertial.aided import _kernels as k
+from railnav.inertial.aided import _kernels as kernels
+from railnav.inertial.aided import layout as k
 from railnav.inertial.aided.aiding import Fixes, Ranges, Rests, VehicleMotion
 from railnav.inertial.aided.integration import Unknowns, Vehicle, integrate
 from railnav.inertial.error_model import error_dynamics, position_scale
@@ -48,7 +49,7 @@ def situation():
 def rows(kind, data, state, value, turn, nominal, age=0.0):
     z, H = np.empty(6), np.empty((6, N))
     acceleration = np.array([0.3, -0.2, 0.1])
-    k.innovations(
+    kernels.innovations(
         kind, data, age, state, value, AT, NINE, nominal, turn, 0.01, acceleration, FIELD, np.empty((3, 3)), z, H
     )
     return z, H
@@ -71,7 +72,7 @@ def test_rows_are_the_derivatives_of_the_innovation(kind, count):
             continue
         x = np.zeros(N)
         x[c] = unit(c)
-        k.corrected(state, value, x, NINE, after, shifted)
+        kernels.corrected(state, value, x, NINE, after, shifted)
         moved = turn - x[AT[k.GYRO_BIAS] : AT[k.GYRO_BIAS] + 3] * 0.01
         other, _ = rows(kind, data, after, shifted, moved, nominal)
         slope = (z - other)[:count] / x[c]
@@ -153,7 +154,7 @@ def test_the_printed_odometer_update():
     flat = np.array([state.latitude, state.longitude, state.height, *state.velocity_n, *state.quaternion_nb])
     z, H = np.empty(6), np.empty((6, N))
     value = np.zeros(NINE)
-    k.innovations(
+    kernels.innovations(
         k.BODY,
         np.array([11.0, *[0.0] * 7]),
         0.0,

@@ -15,11 +15,22 @@ from numba import njit
 from railnav.attitude._kernels import exponential, multiply, rotate
 from railnav.estimation._kernels import smooth_kernel
 from railnav.inertial._kernels import POLAR_LATITUDE, coning_step, error_transition_kernel, radii
+from railnav.inertial.aided.layout import (
+    ANTENNA,
+    AXLE,
+    BODY,
+    CLOCK,
+    FIX,
+    FORCE_BIAS,
+    FORCE_SCALE,
+    GYRO_BIAS,
+    GYRO_SCALE,
+    MOUNTING,
+    ODOMETER,
+    REST,
+    TIME,
+)
 
-#: Groups of parameters in the order of their columns; all true - estimated.
-ANTENNA, AXLE, MOUNTING, TIME, ODOMETER, CLOCK, GYRO_SCALE, FORCE_SCALE, GYRO_BIAS, FORCE_BIAS = range(10)
-#: Kinds of measurement.
-FIX, BODY, REST, RANGE = range(4)
 #: Length over which the acceleration that carries a fix to its sample is averaged, s.
 ACCELERATION_TIME = 0.03
 

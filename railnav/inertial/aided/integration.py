@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from railnav.attitude import dcm_from_rotation_vector, quaternion_from_dcm
 from railnav.errors import EstimationError
-from railnav.inertial.aided import _kernels as k
+from railnav.inertial.aided import layout as k
 from railnav.inertial.aided.aiding import Fixes, Ranges, Rests, VehicleMotion
 from railnav.inertial.error_model import position_scale
 from railnav.inertial.loose import ImuNoise, InitialSigma
@@ -30,20 +30,6 @@ GATE = 15.137
 NODE_STEP = 0.25
 #: Most memory that the nodes of the smoother may take, bytes.
 NODE_MEMORY = 3e9
-#: Name, columns, field of `Unknowns`, by group in the order of the kernels.
-_GROUPS = (
-    ("antenna_arm", 3),
-    ("axle_arm", 3),
-    ("mounting", 2),
-    ("time_offset", 1),
-    ("odometer_scale", 1),
-    ("clock", 2),
-    ("gyro_scale", 3),
-    ("accelerometer_scale", 3),
-    ("gyro_bias", 3),
-    ("accelerometer_bias", 3),
-)
-_KINDS = ("fixes", "vehicle", "rests", "ranges")
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,6 +223,8 @@ def integrate(
     >>> out.sigma[-1, :3].round(1), out.sigma[-1, 3:6].round(2)
     (array([1., 1., 1.]), array([0.03, 0.03, 0.02]))
     """
+    from railnav.inertial.aided._kernels import aided_kernel, smooth_nodes_kernel
+
     t, w, f, interval = _samples(time, rate_ib_b, specific_force_b, start_time)
     if smooth and not closed_loop:
         raise ValueError("the smoother needs the closed loop")
@@ -261,7 +249,7 @@ def integrate(
     )
     driven = np.flatnonzero(spread > 0.0)
     table, kept = _measurements(t, start_time, fixes, vehicle_motion, rests, ranges)
-    limits = np.array([gate.get(name, GATE) for name in _KINDS] if isinstance(gate, Mapping) else [gate] * 4)
+    limits = np.array([gate.get(name, GATE) for name in k.KINDS] if isinstance(gate, Mapping) else [gate] * 4)
     nominal = np.array([*setting.antenna_arm_b, *setting.axle_arm_b, *setting.mounting], dtype=np.float64)
     if nominal.shape != (8,) or not np.isfinite(nominal).all():
         raise ValueError("arms must be three, the mounting two finite numbers")
@@ -280,7 +268,7 @@ def integrate(
     kept_state, kept_value, kept_x = np.empty((K, 10)), np.empty((K, nine)), np.zeros((K, N))
     kept_U, kept_Phi, kept_Q = np.zeros((K, N, N)), np.zeros((K, N, N)), np.zeros((K, N, N))
     U = np.diag(sigma0)
-    done = k.aided_kernel(
+    done = aided_kernel(
         w * interval[:, None],
         f * interval[:, None],
         interval,
@@ -320,7 +308,7 @@ def integrate(
     P_sqrt = np.ascontiguousarray(U.T)
     if smooth:
         error, roots = np.zeros((K, N)), np.zeros((K, N, N))
-        k.smooth_nodes_kernel(kept_U, kept_Phi, kept_Q, kept_x, error, roots)
+        smooth_nodes_kernel(kept_U, kept_Phi, kept_Q, kept_x, error, roots)
         node_time = np.concatenate([[start_time], t[node]])
         out, value = _spread(out, value, np.concatenate([[start_time], t]), node_time, error, kept_x, nine)
         at_nodes = np.sqrt(np.einsum("kij,kij->ki", roots, roots))
@@ -328,8 +316,8 @@ def integrate(
         sigma = np.stack([np.interp(stamps, node_time, column) for column in at_nodes.T], axis=1)
         slant = np.interp(stamps, node_time, np.einsum("kj,kj->k", roots[:, N - 3], roots[:, N - 2]))
     sigma[:, nine + 6 :] *= scale
-    place = [(name, int(at[g]), size) for g, (name, size) in enumerate(_GROUPS) if at[g] >= 0]
-    by_kind = {name: table.kind == code for code, name in enumerate(_KINDS) if np.any(table.kind == code)}
+    place = [(name, int(at[g]), size) for g, (name, size) in enumerate(k.GROUPS) if at[g] >= 0]
+    by_kind = {name: table.kind == code for code, name in enumerate(k.KINDS) if np.any(table.kind == code)}
     return AidedSolution(
         Trajectory(np.concatenate([[start_time], t]), out[:, 0], out[:, 1], out[:, 2], out[:, 3:6], out[:, 6:]),
         np.hstack([sigma[:, nine + 6 :], sigma[:, nine + 3 : nine + 6], sigma[:, nine : nine + 3]]),
@@ -402,12 +390,12 @@ def _menu(
             1.0 / tau_a,
         ),
     }
-    at = np.full(len(_GROUPS), -1, dtype=np.int64)
+    at = np.full(len(k.GROUPS), -1, dtype=np.int64)
     sigma: list[float] = []
     density: list[float] = []
     decay: list[float] = []
     names: list[str] = []
-    for g, (name, size) in enumerate(_GROUPS):
+    for g, (name, size) in enumerate(k.GROUPS):
         s, d, r = rows[name]
         if s == 0.0 and g < k.GYRO_BIAS:
             continue
@@ -445,7 +433,7 @@ def _measurements(
 
     def add(code: int, stamps: FloatArray, values: Any, sigmas: Any) -> None:
         inside = np.flatnonzero((stamps > start_time) & (stamps <= t[-1]))
-        kept[_KINDS[code]] = inside
+        kept[k.KINDS[code]] = inside
         row = np.searchsorted(t, stamps[inside], side="left")
         table, variance = np.zeros((len(inside), 8)), np.zeros((len(inside), 8))
         for c, v in enumerate(values):
