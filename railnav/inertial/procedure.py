@@ -492,5 +492,8 @@ def _noise(
     for x in (log.imu.gyro, log.imu.specific_force):
         curves = [allan_deviation(x[:, axis], interval) for axis in range(3)]
         fits = [fit_allan(c, terms=terms) for c in curves]
-        out.append(TriadNoise(max(p.random_walk for p in fits), max(p.bias_instability for p in fits)))
+        floors = [
+            p.bias_instability for p, c in zip(fits, curves, strict=True) if p.stands_out("bias_instability", c.time)
+        ]
+        out.append(TriadNoise(max(p.random_walk for p in fits), max(floors, default=0.0)))
     return out[0], out[1]

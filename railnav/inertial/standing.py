@@ -175,6 +175,13 @@ def align_standing(
                 f"{_hour(earth):.1f} deg/h"
             )
             found = replace(found, note=note)
+    coning = coning_rate(w[rows], interval)
+    by_noise = _density(w[rows], interval) ** 2  # white noise alone encloses about half of its density squared a second
+    if coning > max(5.0 * by_noise, 0.5 * math.hypot(gyro, float(still.sigma_rate.max()))):
+        remarks.append(
+            f"the base cones: {_hour(coning):.2f} deg/h are added to the Earth's rotation, which heading and latitude take "
+            "for it; stop the machine"
+        )
     remarks += _mounted(imu, imu.specific_force[rows].mean(axis=0), found)
     where, sigma_where, why = _latitude(still, gyro, force)
     refined = None
@@ -208,7 +215,7 @@ def align_standing(
         where,
         sigma_where,
         why,
-        coning_rate(w[rows], interval),
+        coning,
         gyro,
         force,
         None if heading is None else heading[0],

@@ -124,6 +124,26 @@ def test_a_bias_larger_than_stated_is_noticed() -> None:
     assert got.latitude is None
 
 
+def test_a_base_that_cones_is_told() -> None:
+    """A cone of half a tenth of a degree at 5 Hz: no piece of the log moves on the mean, but the latitude is degrees off."""
+    run = standing()
+    assert run.imu is not None
+    t, half, turn = run.imu.time, 0.1 * DEGREE, 2 * np.pi * 5
+    cone = turn * np.column_stack(
+        [-np.sin(half) * np.sin(turn * t), np.sin(half) * np.cos(turn * t), np.full_like(t, -2 * np.sin(half / 2) ** 2)]
+    )
+    got = align_standing(Run("x", START, imu=ImuStream(t, run.imu.gyro + cone, run.imu.specific_force)), **knowing())
+    assert got.coning / HOUR == pytest.approx(9.9, rel=0.05)
+    assert any("the base cones: 9" in remark or "the base cones: 10" in remark for remark in got.remarks)
+    assert not any("cones" in remark for remark in align_standing(run, **knowing()).remarks)
+    mems = {"gyro": 36 * HOUR, "force": 0.02, "arw": 4.5 * DEGREE / 60, "vrw": 0.0167}
+    for seed in range(20):
+        assert not any(
+            "cones" in remark
+            for remark in align_standing(standing(seed=seed, seconds=20.0, unit=mems), **knowing(mems)).remarks
+        )
+
+
 def moving(seconds: float = 60.0, acceleration: float = 0.0) -> Run:
     run = standing(seconds=seconds)
     assert run.imu is not None
