@@ -60,6 +60,9 @@ UNITS = ("L3G4200D", "IMU440", "RT3003", "STIM300", "ASM330LHH")
     show_default=True,
     help="Shortest rest that counts when one long log is cut into positions, s.",
 )
+@click.option(
+    "--plan", is_flag=True, help="Print which positions to take for the method, as a positions.toml, and stop."
+)
 @click.option("--simulate", is_flag=True, help="Make POSITIONS instead: a simulated set for the method.")
 @click.option(
     "--unit", type=click.Choice(UNITS), default="IMU440", show_default=True, help="Data sheet of the simulated unit."
@@ -86,6 +89,7 @@ def command(
     keep: Path | None,
     name: str | None,
     shortest: float,
+    plan: bool,
     simulate: bool,
     unit: str,
     seed: int,
@@ -101,9 +105,17 @@ def command(
 
     \b
     Example:
+      railnav calibrate positions --plan --method turns
       railnav calibrate positions --simulate --method multi-position --seed 7
       railnav calibrate positions --method multi-position -o imu.toml
     """  # noqa: D301
+    if plan:
+        from railnav.io.positions import plan_text
+
+        if len(methods) != 1:
+            raise click.UsageError("--plan is for one method")
+        click.echo(plan_text(methods[0], rate=rate or 60.0), nl=False)  # type: ignore[arg-type]
+        return
     if simulate:
         _simulate(positions, methods, unit, seed, latitude, rate, temperature_degree, fault, as_json)
         return

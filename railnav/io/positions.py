@@ -5,6 +5,7 @@ r"""Sets of positions for a calibration: a folder of run folders or of tables, o
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,8 +18,11 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from railnav.errors import InputError, RunError
+from railnav.inertial.advice import advise_positions, axes_up
 from railnav.inertial.mechanization import GravityField
 from railnav.inertial.positions import PositionLog
+from railnav.inertial.procedure import METHODS, RATE_METHODS, Method
+from railnav.inertial.turns import advise_turns
 from railnav.io.atomic import atomic_folder
 from railnav.io.run import CONTENTS, read_imu_table, read_run, write_run
 from railnav.run import ImuStream, Run
@@ -178,6 +182,64 @@ def write_positions(
                     x = np.round(np.asarray(values, dtype=np.float64), 12) + 0.0
                     lines.append(f"{key} = {x.tolist()!r}")
         (draft / NOTES).write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+
+
+def plan_text(method: Method, *, count: int = 12, step: float = 30.0, rate: float = 60.0) -> str:
+    """Text of a `positions.toml` that says which positions to take for a method, best first.
+
+    Parameters
+    ----------
+    method : str
+        One of `railnav.inertial.METHODS`.
+    count : int, optional
+        Positions of the multi-position methods (at least 9) and of turns (at least 4).
+    step : float, optional
+        Smallest turn of the dividing head, degrees.
+    rate : float, optional
+        Of the table, degrees per second.
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    ValueError
+        An unknown method, or too few positions for it.
+    EstimationError
+        Turns by this step determine nothing.
+
+    Examples
+    --------
+    >>> print(plan_text("six-position").splitlines()[3])
+    up = "+x"
+    """
+    if method not in METHODS:
+        raise ValueError(f"no method {method!r}; there are {', '.join(METHODS)}")
+    least = {"turns": 4, "multi-position": 9, "modified-multi-position": 9}.get(method, 6)
+    if count < least:
+        raise ValueError(f"{count} positions are too few for {method}; at least {least}")
+    lines: list[str] = []
+    told = [f"rate_deg_s = {rate!r}"] if method in RATE_METHODS else []
+    if method == "turns":
+        multiples, reached = advise_turns(math.radians(step), count)
+        lines.append(
+            f"# turns by {' : '.join(map(str, multiples))} times {step:g} degrees about x, y, z: condition {reached.condition:.2f}"
+        )
+        entries = [[f"turns_deg = {[float(k * m * step) for m in multiples]!r}"] for k in range(count)]
+    else:
+        if method.endswith("six-position"):
+            ups = np.array([sign * axis for axis in np.eye(3) for sign in (1.0, -1.0)])
+            lines.append("# each axis up and down, levelled to a degree")
+        else:
+            faces = np.array([sign * axis for axis in np.eye(3) for sign in (1.0, -1.0)])
+            ups = np.vstack([faces, advise_positions(faces, count - 6)])
+            lines.append("# attitudes need not be exact; spread over all sides")
+        entries = [[f'up = "{axes_up(up)}"', *told] for up in ups]
+    lines[0] += "; the turn axis is the one that points up" if told else ""
+    for k, entry in enumerate(entries, start=1):
+        lines += ["[[position]]", f'log = "{k:02d}"', *entry]
+    return "\n".join(lines) + "\n"
 
 
 def _read(path: Path) -> tuple[ImuStream, Run | None]:

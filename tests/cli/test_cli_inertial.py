@@ -57,6 +57,31 @@ def test_every_method_runs_on_what_simulate_makes(tmp_path: Path, method: str) -
     assert np.all(np.abs(error) < 5.0 * np.array(got[what][f"sigma_bias_{spelled}"]))
 
 
+@pytest.mark.parametrize(
+    "method", ["six-position", "modified-six-position", "multi-position", "modified-multi-position", "turns"]
+)
+def test_a_plan_is_a_set_of_positions_that_can_be_solved(tmp_path: Path, method: str) -> None:
+    import tomllib
+
+    from railnav.inertial import multi_position, solvability, turned_force
+    from railnav.io.positions import _up
+
+    text = run("calibrate", "positions", "--plan", "--method", method, "--rate", "30").stdout
+    planned = tomllib.loads(text)["position"]
+    if method == "turns":
+        assert "2 : 4 : 1" in text
+        found = solvability(turned_force(*np.radians([p["turns_deg"] for p in planned]).T))
+        assert (found.rank, round(found.condition, 2)) == (4, 1.79)
+        return
+    ups = np.array([_up(p["up"], tmp_path, 0) for p in planned])
+    assert all(p.get("rate_deg_s") == (30.0 if method.startswith("modified") else None) for p in planned)
+    if method.endswith("six-position"):
+        assert sorted(p["up"] for p in planned) == ["+x", "+y", "+z", "-x", "-y", "-z"]
+    else:
+        assert len(ups) == 12
+        assert multi_position(ups * [1.01, 0.99, 1.0], 1.0).condition < 4.0
+
+
 def test_two_methods_and_an_earlier_file(bench: Path, tmp_path: Path) -> None:
     run(
         "calibrate",
