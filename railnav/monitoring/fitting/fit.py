@@ -271,13 +271,13 @@ def _segment(
     bend = float(np.clip(np.percentile(np.abs(smooth), 90), 2e-4, 0.05))
     rate = float(np.clip(bend / 20.0, 5e-6, 5e-3))
 
-    def pieces(noise: Noise, part: slice) -> Pieces:
+    def pieces(noise: Noise, part: slice, beam: int = segmentation.NARROW) -> Pieces:
         return segmentation.segment_plan(
-            along[part], east[part], north[part], noise, window=window, curvature_scale=bend, rate_scale=rate
+            along[part], east[part], north[part], noise, window=window, curvature_scale=bend, rate_scale=rate, beam=beam
         )
 
     noise = likeliest(pieces, len(along), chosen.spacing, white, floor=FLOOR, stated=sigma)
-    return noise, pieces(noise, slice(0, len(along))), ref
+    return noise, pieces(noise, slice(0, len(along)), segmentation.BEAM), ref
 
 
 def _simplified(fit: PlanFit, east: FloatArray, north: FloatArray, sigma: FloatArray, noise: Noise) -> PlanFit:
@@ -516,11 +516,11 @@ def _profile(
     smooth = np.convolve(slope, np.ones(wide) / wide, mode="same")
     bend = float(np.clip(np.percentile(np.abs(np.gradient(smooth, place)), 90), 2e-5, 2e-3))
 
-    def pieces(noise: Noise, part: slice) -> Pieces:
-        return segmentation.segment_profile(along[part], height[part], noise, bend_scale=bend)
+    def pieces(noise: Noise, part: slice, beam: int = segmentation.NARROW) -> Pieces:
+        return segmentation.segment_profile(along[part], height[part], noise, bend_scale=bend, beam=beam)
 
     noise = likeliest(pieces, len(along), chosen.spacing, white, floor=FLOOR, stated=sigma)
-    found = stretches.stretches_of_pieces(pieces(noise, slice(0, len(along))), along, height, 2)
+    found = stretches.stretches_of_pieces(pieces(noise, slice(0, len(along)), segmentation.BEAM), along, height, 2)
     per_point = np.full(len(along), float(np.hypot(np.mean(noise.sigma), noise.correlated)))
     fitted = stretches.fit_stretches(found, along, height, per_point)
     fitted, each = _settle_stretches(fitted, along, height, per_point, noise, sigma, 2)
@@ -547,11 +547,11 @@ def _cant(
     pick = np.arange(0, len(along), chosen.every)
     along, cant = along[pick], cant[pick]
 
-    def pieces(noise: Noise, part: slice) -> Pieces:
-        return segmentation.segment_cant(along[part], cant[part], noise, rate_scale=1e-3)
+    def pieces(noise: Noise, part: slice, beam: int = segmentation.NARROW) -> Pieces:
+        return segmentation.segment_cant(along[part], cant[part], noise, rate_scale=1e-3, beam=beam)
 
     noise = likeliest(pieces, len(along), chosen.spacing, chosen.sigma, floor=FLOOR_CANT)
-    found = stretches.stretches_of_pieces(pieces(noise, slice(0, len(along))), along, cant, 1)
+    found = stretches.stretches_of_pieces(pieces(noise, slice(0, len(along)), segmentation.BEAM), along, cant, 1)
     per_point = np.full(len(along), float(np.hypot(np.mean(noise.sigma), noise.correlated)))
     fitted = stretches.fit_stretches(found, along, cant, per_point)
     fitted, each = _settle_stretches(fitted, along, cant, per_point, noise, None, 1)

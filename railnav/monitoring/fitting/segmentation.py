@@ -32,7 +32,8 @@ _PRICE = 8.0
 _JUMP_PRICE = 10.0
 #: Hypotheses that cost more than the cheapest by this are given up.
 _MARGIN = 70.0
-_BEAM = 240
+#: Hypotheses that go on: for the answer, and for the noise alone.
+BEAM, NARROW = 240, 60
 
 #: From, to, lowest derivative that breaks, further price.
 _PLAN_RULES = (
@@ -143,6 +144,7 @@ def segment_plan(
     every: float = 0.0,
     curvature_scale: float,
     rate_scale: float,
+    beam: int = BEAM,
 ) -> Pieces:
     """Pieces of a plan.
 
@@ -160,6 +162,8 @@ def segment_plan(
         Least distance between places where a piece may begin, m.
     curvature_scale, rate_scale : float
         What curvatures (1/m) and their changes along the track (1/m^2) are like.
+    beam : int
+        Hypotheses that go on.
     """
     ref_e, ref_n, bearing, _ = reference(along, east, north, window)
     sin, cos = np.sin(bearing), np.cos(bearing)
@@ -183,11 +187,12 @@ def segment_plan(
         np.array([STRAIGHT, ARC, TRANSITION]),
         np.array([1.0, 0.01, curvature_scale**2, rate_scale**2]),
         every,
+        beam,
     )
 
 
 def segment_profile(
-    along: FloatArray, height: FloatArray, noise: Noise, *, every: float = 0.0, bend_scale: float
+    along: FloatArray, height: FloatArray, noise: Noise, *, every: float = 0.0, bend_scale: float, beam: int = BEAM
 ) -> Pieces:
     """Pieces of a profile: grades, and vertical curves whose slope changes evenly, `bend_scale` a metre (1/m)."""
     zero = np.zeros(len(along) - 1)
@@ -204,10 +209,13 @@ def segment_profile(
         np.array([GRADE, CURVE]),
         np.array([1.0, 1e-3, bend_scale**2]),
         every,
+        beam,
     )
 
 
-def segment_cant(along: FloatArray, cant: FloatArray, noise: Noise, *, every: float = 0.0, rate_scale: float) -> Pieces:
+def segment_cant(
+    along: FloatArray, cant: FloatArray, noise: Noise, *, every: float = 0.0, rate_scale: float, beam: int = BEAM
+) -> Pieces:
     """Pieces of cant: level, and ramps of about `rate_scale` m a metre."""
     zero = np.zeros(len(along) - 1)
     return _run(
@@ -222,6 +230,7 @@ def segment_cant(along: FloatArray, cant: FloatArray, noise: Noise, *, every: fl
         np.array([LEVEL, RAMP]),
         np.array([0.01, rate_scale**2]),
         every,
+        beam,
     )
 
 
@@ -237,6 +246,7 @@ def _run(
     first: IntArray,
     prior: FloatArray,
     every: float,
+    beam: int,
 ) -> Pieces:
     n = len(along)
     if n < 8:
@@ -265,7 +275,7 @@ def _run(
         table,
         price,
         prior,
-        _BEAM,
+        beam,
         _MARGIN,
     )
     return Pieces(found[:, 0].copy(), found[:, 1].copy(), found[:, 2].copy(), float(cost))
