@@ -56,7 +56,12 @@ TAGS = 6
 #: much of it is believed, path coordinate up to which balises are accounted for; then its ledger, what each kind of evidence has added
 #: to its log-weight.
 SLIP_SINCE, AGREE_SINCE, FADING, BELIEVED, PASSED = range(5)
-LEDGER = 5
+#: Dead reckoning by the wheel from a while ago: when it began, place, wheel distance and scale then, variances of place and scale; twice,
+#: the older one in use.
+CHECK = 5
+CHECK_SIZE = 6
+CHECK_TIME, CHECK_PLACE, CHECK_WHEEL, CHECK_SCALE, CHECK_VARIANCE, CHECK_SCALE_VARIANCE = range(6)
+LEDGER = CHECK + 2 * CHECK_SIZE
 (
     BY_PATH,  # prior of the start and of each turnout's legs, the end of the line
     BY_POSITION,

@@ -62,8 +62,12 @@ from railnav.navigation.columns import (
     C_FRAME_SIGMA,
     C_FRAME_TIME,
     C_FRESH,
+    C_FROZEN,
     C_GNSS_SPEED,
+    C_GYRO_FAULTS,
     C_JUMPS,
+    C_LAST_EAST,
+    C_LAST_NORTH,
     C_NOTHING_NEAR,
     C_OUT_MODE,
     C_RING,
@@ -82,13 +86,18 @@ from railnav.navigation.columns import (
     C_SUSPECTS,
     C_TIME,
     C_TRY,
+    C_YAW_DISTRUST,
+    C_YAW_MISFIT,
+    COAST_LONGEST,
     DISTANCE,
     DISTRUST,
     DONE,
     DOUBTED,
     EAST,
+    ESTABLISHED,
     FORCE,
     GNSS_EAST,
+    GYRO_BIAS,
     HELD,
     K_CORRELATED,
     K_FRAME,
@@ -97,6 +106,7 @@ from railnav.navigation.columns import (
     K_GATE,
     K_GNSS_TIME,
     K_GRAVITY,
+    K_GYRO_BIAS,
     K_LOST_AFTER,
     K_LOST_SIGMA,
     K_MAP_LENGTH,
@@ -119,6 +129,8 @@ from railnav.navigation.columns import (
     NEEDS_RIVALS,
     NEEDS_ROOM,
     NEEDS_START,
+    NORTH,
+    ODOMETER_SCALE,
     OUT_MODE,
     POSITION,
     PULLS,
@@ -129,6 +141,7 @@ from railnav.navigation.columns import (
     R_VERSION,
     RING,
     RIVAL_INTERVAL,
+    ROW_GATE,
     S_NIS,
     S_PULL,
     S_SAID,
@@ -139,12 +152,15 @@ from railnav.navigation.columns import (
     S_STRETCH,
     S_TAG,
     S_TRAVEL,
+    S_YAW,
     SIGMA_EAST,
+    SIGMA_FORCE,
     SIGMA_NORTH,
     SPEED,
     SPEED_LATENCY,
     START_GATE,
     START_PROBATION,
+    STEP_MOST,
     TIME,
     TIME_TAG,
     W_BEFORE,
@@ -155,6 +171,9 @@ from railnav.navigation.columns import (
     W_MOVE,
     W_NEW,
     WHEEL_DISTANCE,
+    YAW_DISTRUST,
+    YAW_MISFIT,
+    YAW_SPAN,
 )
 from railnav.navigation.decision import _kernels as decision
 from railnav.navigation.decision._kernels import keep_journal, put_out
@@ -170,6 +189,7 @@ from railnav.navigation.dynamics._kernels import (
     widen,
 )
 from railnav.navigation.integrity import _kernels as integrity
+from railnav.navigation.integrity._kernels import keep_check
 from railnav.navigation.measurements import _kernels as measurements
 from railnav.navigation.measurements._kernels import (
     balise_place,
@@ -180,7 +200,7 @@ from railnav.navigation.measurements._kernels import (
     wheel_row,
 )
 from railnav.navigation.standing import _kernels as standing
-from railnav.navigation.standing._kernels import depart, heaviest, kick, remember, stands, watch
+from railnav.navigation.standing._kernels import depart, heaviest, hold_repeated, kick, remember, stands, watch
 
 # ---------------------------------------------------------------- what all hypotheses share
 
@@ -282,6 +302,7 @@ def predict_all(fil, net, bank, work, row, dt):
             dt,
             slot[S_SIGN],
             row[FORCE],
+            row[SIGMA_FORCE],
             slot[S_PULL],
             0.0,
             0.0,
@@ -295,6 +316,23 @@ def predict_all(fil, net, bank, work, row, dt):
             work.vector[W_NEW],
         )
         predict(x, bank.P_sqrt[h], work.F, work.Q, work.lead, columns, work.vector[W_NEW])
+
+
+@part
+def frozen(fil, shared, bank, row):
+    """Whether a fix repeats the one before to the last digit while the train moves: no news, whatever its sigma says."""
+    common = shared.common
+    same = row[EAST] == common[C_LAST_EAST] and row[NORTH] == common[C_LAST_NORTH]
+    common[C_LAST_EAST] = row[EAST]
+    common[C_LAST_NORTH] = row[NORTH]
+    if not same:
+        return False
+    best = heaviest(bank)
+    i_v = fil.at[SPEED]
+    if abs(bank.x[best, i_v]) < 1.0 + 4.0 * math.sqrt(variance_of(bank.P_sqrt[best], i_v)):
+        return False
+    common[C_FROZEN] += 1.0
+    return True
 
 
 @part
@@ -382,18 +420,38 @@ def sense_all(fil, net, shared, bank, work, row, dt):
                 continue
             evidence, slip, shake = wheel_row(fil, shared, bank, work, h, row, leader)
             credit(bank, h, BY_ODOMETER, evidence)
+            keep_check(fil, bank, h, row[TIME], slip > 0.0 or shake > 0.0)
             work.slot[h, S_SLIP] = slip
             work.slot[h, S_SHAKE] += shake
+    worst = np.inf  # of the yaw rate's squared normalised innovations the least
     for i in range(bank.live[0]):
         h = bank.live[1 + i]
         x = bank.x[h]
+        work.slot[h, S_YAW] = np.inf
         path_point(net, bank, h, x[i_s], work.point[h])
         work.point[h, POINT_SIZE] = x[i_s]
         motion_rows(fil, net, shared, bank, work, h, row, dt, still)
+        worst = min(worst, work.slot[h, S_YAW])
         if bank.tags[h, MOVED] == 0 and abs(x[i_v]) > max(0.5, 3.0 * math.sqrt(variance_of(bank.P_sqrt[h], i_v))):
             bank.tags[h, MOVED] = 1
             reverse = fil.settings[K_REVERSE]
             credit(bank, h, BY_PATH, math.log(reverse if x[i_v] < 0.0 else 1.0 - reverse))
+    if worst < np.inf:
+        judge_gyro(fil, shared, bank, work, row[TIME], dt, worst)
+
+
+@part
+def judge_gyro(fil, shared, bank, work, time, dt, worst):
+    """Stop believing a yaw gyro whose rates fit no hypothesis; its bias may have stepped."""
+    common = shared.common
+    share = min(dt / YAW_SPAN, 1.0)
+    common[C_YAW_MISFIT] += share * ((1.0 if worst > ROW_GATE else 0.0) - common[C_YAW_MISFIT])
+    if common[C_YAW_MISFIT] > YAW_MISFIT and time >= common[C_YAW_DISTRUST]:
+        common[C_YAW_DISTRUST] = time + YAW_DISTRUST * 2.0 ** min(common[C_GYRO_FAULTS], 8.0)
+        common[C_YAW_MISFIT] = 0.0
+        common[C_GYRO_FAULTS] += 1.0
+        for i in range(bank.live[0]):
+            widen(bank.P_sqrt[bank.live[1 + i]], fil.at[GYRO_BIAS], fil.settings[K_GYRO_BIAS], work.vector[W_COLUMN])
 
 
 @part
@@ -449,6 +507,10 @@ def fix_all(fil, net, shared, bank, work, row):
             common[C_TRY] = -np.inf
             return False
         step, tag = jump(fil, shared, bank, work)
+        sigma = common[C_SCALE] * k[K_CORRELATED] * common[C_SIGMA_EAST]
+        far = step * sigma * sigma > STEP_MOST * STEP_MOST or common[C_JUMPS] > 2.0
+        if far and at[ODOMETER_SCALE] >= 0 and time - common[C_START_TIME] > ESTABLISHED:
+            return False
         common[C_STEPS] += 1.0
         if common[C_GNSS_SPEED] < 0.5 and at[SPEED_LATENCY] >= 0:
             common[C_DISTRUST] = time + DISTRUST
@@ -577,7 +639,12 @@ def advance(fil, net, shared, bank, work, records, row, epoch):
         return
     sense_all(fil, net, shared, bank, work, row, dt)
     most = int(k[K_MOST])
-    if row[EAST] == row[EAST] and row[SIGMA_EAST] <= k[K_USABLE] and row[SIGMA_NORTH] <= k[K_USABLE]:
+    if (
+        row[EAST] == row[EAST]
+        and row[SIGMA_EAST] <= k[K_USABLE]
+        and row[SIGMA_NORTH] <= k[K_USABLE]
+        and not frozen(fil, shared, bank, row)
+    ):
         since = time - common[C_FIX_TIME]
         accepted = fix_all(fil, net, shared, bank, work, row)
         normalise(bank, shared.weight, k[K_PRUNE], most)
@@ -586,7 +653,12 @@ def advance(fil, net, shared, bank, work, records, row, epoch):
             if not fresh:
                 adapt(fil, shared, bank, work, time, min(since, 10.0))
                 normalise(bank, shared.weight, k[K_PRUNE], most)
-        if common[C_JUMPS] > 4.0 or (not accepted and time - common[C_SUSPECT_SINCE] > k[K_LOST_AFTER]):
+        longest = k[K_LOST_AFTER]
+        if common[C_SUSPECT_SINCE] - common[C_START_TIME] > ESTABLISHED and fil.at[ODOMETER_SCALE] >= 0:
+            longest = COAST_LONGEST
+        if (common[C_JUMPS] > 4.0 and longest < COAST_LONGEST) or (
+            not accepted and time - common[C_SUSPECT_SINCE] > longest
+        ):
             common[C_JUMPS] = 0.0
             common[C_SUSPECTS] = 0.0
             drop_all(bank)
@@ -629,6 +701,7 @@ def _compiled(stamp: int) -> Any:
                     shared.common[C_STRANGE_BALISES] += 1.0
                     return e, NEEDS_BALISE
             watch(fil, shared, row)
+            hold_repeated(fil, shared, bank, row)
             advance(fil, net, shared, bank, work, records, row, e)
             remember(shared, row)
             put_out(fil, net, shared, bank, work, row, out[e])

@@ -71,6 +71,7 @@ K_ACC_SIGMA = SETTING["acceleration_sigma"]
 K_ACC_TIME = SETTING["acceleration_time"]
 K_FORCE_NOISE = SETTING["accelerometer_noise"]
 K_FORCE_WALK = SETTING["accelerometer_walk"]
+K_GYRO_BIAS = SETTING["gyro_bias"]
 K_GYRO_WALK = SETTING["gyro_walk"]
 K_GYRO_FLOOR = SETTING["gyro_floor"]
 K_GYRO_SCALE = SETTING["gyro_scale"]
@@ -79,6 +80,7 @@ K_SIDE_NOISE = SETTING["side_noise"]
 K_SIDE_TIME = SETTING["side_time"]
 K_SIDE_SCALE = SETTING["side_scale"]
 K_BALISE_SIGMA = SETTING["balise_sigma"]
+K_GNSS_FAULT = SETTING["gnss_fault"]
 K_BALISE_MISSED = SETTING["balise_missed"]
 K_CURVATURE_SIGMA = SETTING["curvature_sigma"]
 K_CURVATURE_SHIFT = SETTING["curvature_shift"]
@@ -126,8 +128,9 @@ K_GRAVITY = SETTING["gravity"]
     BALISE_TRACK,  # index of the track of the balise that is read
     BALISE_OFFSET,  # from that track's start, m
     SIGMA_BALISE,
-) = range(19)
-EPOCH_SIZE = 19
+    SIGMA_FORCE,  # of the means of specific force
+) = range(20)
+EPOCH_SIZE = 20
 
 #: Columns of the output table.
 (
@@ -191,8 +194,22 @@ OUTPUT_SIZE = 13
     C_BALISE_TIME,  # latest reading
     C_BALISES,
     C_STRANGE_BALISES,
-) = range(42)
-COMMON_SIZE = 42
+    C_LAST_EAST,  # latest fix, to tell one that is repeated
+    C_LAST_NORTH,
+    C_FROZEN,  # fixes that repeat the one before while the train moves
+    C_LAST_FORCE,
+    C_LAST_SIDE,
+    C_LAST_YAW,
+    C_REPEATED,  # inertial means that repeat the ones before
+    C_YAW_MISFIT,  # share of yaw rates lately that fit no hypothesis
+    C_YAW_DISTRUST,  # until when the yaw gyro is not believed
+    C_GYRO_FAULTS,
+    C_ACCELEROMETER_FAULTS,
+    C_ODOMETER_FAULTS,
+    C_BLAMED,  # when wheel and receiver agreed against the accelerometer
+    C_RESCALED,  # when the receiver confirmed the speed against the wheel for long
+) = range(56)
+COMMON_SIZE = 56
 #: How often tracks nearby that no hypothesis holds are given a rival, s.
 RIVAL_INTERVAL = 60.0
 #: Odometer readings remembered: time, distance.
@@ -227,6 +244,17 @@ BRIDGED = 3.0
 HELD = 0.6
 #: Sigmas past a toe at which a turnout's leg may be declared.
 GUARD = 3.0
+#: A jump of the position beyond this is no step of a GNSS error but a fault, m: the train coasts until fixes fit again ...
+STEP_MOST = 60.0
+#: ... for so many seconds, where the train has wheels or inertial sensors to coast on and its place was known for long before.
+COAST_LONGEST = 300.0
+ESTABLISHED = 60.0
+#: Yaw rates are no longer believed when this share of those of some seconds fits no hypothesis; and for how long then, s.
+YAW_MISFIT, YAW_SPAN, YAW_DISTRUST = 0.5, 2.0, 60.0
+#: By how much an accelerometer's bias or a wheel's scale may have stepped when the other speeds agree against it.
+FORCE_STEP, SCALE_STEP = 0.3, 0.05
+#: How often dead reckoning by the wheel begins anew, s.
+CHECK_INTERVAL = 60.0
 #: How much weaker the evidence of positions is when model or receiver are off by more than they say: sigmas five times as large.
 DOUBTED = 25.0
 #: Change of curvature a metre that the linearised course allows for, 1/m^2.
@@ -244,8 +272,8 @@ PULLS = 8
 #: Rows of `Work.vector`.
 W_NEW, W_H, W_F, W_KEEP, W_MOVE, W_COLUMN, W_BEFORE = range(7)
 #: Columns of `Work.slot`: what the filter did to a hypothesis (PULLS numbers as in a record), NIS and ln p of the fix, track's posterior.
-S_PULL, S_SLIP, S_SHAKE, S_STEP, S_TAG, S_SIGN, S_TRAVEL, S_STRETCH, S_NIS, S_SAID, S_MASS = range(11)
-SLOT_SIZE = 11
+S_PULL, S_SLIP, S_SHAKE, S_STEP, S_TAG, S_SIGN, S_TRAVEL, S_STRETCH, S_NIS, S_SAID, S_MASS, S_YAW = range(12)
+SLOT_SIZE = 12
 #: Noise columns at most.
 NOISES = 16
 
@@ -270,7 +298,7 @@ class Filter(NamedTuple):
     at: IntArray  # (17,) index of each state, -1 absent
     settings: FloatArray  # Settings.packed()
     lever: FloatArray  # (3,) reference point to antenna: forward, right, down, m
-    risk: FloatArray  # (2,) integrity risk, two-sided normal quantile
+    risk: FloatArray  # (3,) integrity risk, two-sided normal quantile, quantile at that risk over the probability of a GNSS fault
     signed: int  # 1: the odometer counts backwards when backing up
     map_sigma: float = 0.0  # usual error of the model across its tracks, m
     reads_balises: int = 0  # 1: the train has a reader: a balise passed in silence is evidence

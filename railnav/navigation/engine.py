@@ -27,6 +27,8 @@ IntArray = NDArray[np.int64]
 
 #: Hypotheses that fit at a time (more than are kept, for those at a start or a fan of turnouts), and tracks in a window.
 SLOTS, WINDOW = 48, 12
+#: When the older and the newer dead reckoning of a hypothesis began.
+_CHECKS = [paths.CHECK + paths.CHECK_TIME, paths.CHECK + paths.CHECK_SIZE + paths.CHECK_TIME]
 #: Most that a rival can gain or lose by the GNSS error that the train on its track would have, nat.
 RIVAL_CREDIT = 6.0
 #: Prior odds of a place that a balise shows and no hypothesis is near.
@@ -119,7 +121,7 @@ class Engine:
             at,
             self.settings.packed(),
             np.array(lever_arm_b, np.float64).reshape(3),
-            np.array([integrity_risk, normal_quantile(integrity_risk)]),
+            np.array([integrity_risk, normal_quantile(integrity_risk), _fault_quantile(integrity_risk, self.settings)]),
             int(signed_odometer),
             float(np.median(self.network.sigma_cross)),
             int(balises),
@@ -139,9 +141,10 @@ class Engine:
         )
         common = np.zeros(c.COMMON_SIZE)
         never = [c.C_TIME, c.C_FIX_TIME, c.C_TRY, c.C_WHEEL_SEEN, c.C_GNSS_SPEED_TIME, c.C_DISTRUST, c.C_BALISE_TIME]
-        common[never] = -np.inf
+        common[[*never, c.C_YAW_DISTRUST, c.C_BLAMED, c.C_RESCALED]] = -np.inf
         common[[c.C_WHEEL_MOVED, c.C_GNSS_STILL]] = np.inf
         common[c.C_SCALE] = self.settings.scale_start
+        common[[c.C_LAST_EAST, c.C_LAST_FORCE, c.C_LAST_SIDE, c.C_LAST_YAW]] = np.nan
         common[[c.C_OUT_TRACK, c.C_TOLD_TRACK]] = -1.0
         ring = np.column_stack([np.full(c.RING, -np.inf), np.full(c.RING, np.nan)])
         self.shared = c.Shared(common, ring, np.zeros(SLOTS))
@@ -270,8 +273,10 @@ class Engine:
                 bank.tags[h, paths.SIGN] = 1 if v >= 0.0 else -1
                 bank.info[h] = 0.0
                 bank.info[h, [paths.SLIP_SINCE, paths.AGREE_SINCE]] = -np.inf
+                bank.info[h, _CHECKS] = np.inf, -np.inf
                 bank.info[h, paths.BY_PATH] = math.log(prior)
                 bank.info[h, paths.PASSED] = local
+            bank.info[h, _CHECKS] = np.inf, -np.inf
 
         self._foresee(row, {start.track for start in found}, total)
 
@@ -376,6 +381,7 @@ class Engine:
             bank.info[h, [paths.FADING, paths.BELIEVED]] += likelier
             bank.info[h, paths.BY_PATH] += math.log(odds)
             bank.info[h, paths.PASSED] = local
+            bank.info[h, _CHECKS] = np.inf, -np.inf
             bank.info[h, paths.BY_POSITION] += likelier
         if self._unseen:
             away = np.hypot(self._loose[:, 2] - here[0], self._loose[:, 3] - here[1])
@@ -416,6 +422,7 @@ class Engine:
             bank.info[h] = bank.info[best]
             bank.info[h, paths.BY_PATH] += math.log(0.5 * BALISE_PRIOR)
             bank.info[h, paths.PASSED] = local
+            bank.info[h, _CHECKS] = np.inf, -np.inf
 
     def _believing(
         self, x: FloatArray, P: FloatArray, error: FloatArray, spread: FloatArray, point: FloatArray
@@ -484,6 +491,11 @@ class Engine:
         ):  # only these tell a train that is pushed
             chosen += [(-way, -speed, sigma, True, reverse / len(ways)) for way in ways]
         return chosen
+
+
+def _fault_quantile(risk: float, settings: Settings) -> float:
+    """Two-sided quantile at the risk over the probability of a GNSS fault; 0 where that is not reckoned with."""
+    return normal_quantile(risk / settings.gnss_fault) if settings.gnss_fault > risk else 0.0
 
 
 def _settings_for(model: TrackModel, settings: Settings) -> Settings:

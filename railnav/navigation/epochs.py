@@ -57,6 +57,8 @@ class Epoch:
         Rate about the vehicle's down axis, mean since the epoch before, and sigma of that mean, rad/s.
     side_force : float
         Specific force to the vehicle's right, mean since the epoch before, m/s^2.
+    sigma_force : float
+        Sigma of the means of specific force, m/s^2.
     sigma_balise : float
         Sigma of the balise's place, m.
     balise : str
@@ -79,6 +81,7 @@ class Epoch:
     yaw_rate: float = NAN
     sigma_yaw_rate: float = NAN
     side_force: float = NAN
+    sigma_force: float = NAN
     sigma_balise: float = NAN
     balise: str = ""
 
@@ -101,6 +104,7 @@ _PLAIN = tuple(
         ("yaw_rate", c.YAW_RATE),
         ("sigma_yaw_rate", c.SIGMA_YAW),
         ("side_force", c.SIDE),
+        ("sigma_force", c.SIGMA_FORCE),
         ("balise_track", c.BALISE_TRACK),
         ("balise_offset", c.BALISE_OFFSET),
         ("sigma_balise", c.SIGMA_BALISE),
@@ -133,7 +137,7 @@ def epochs(run: Run) -> Iterator[Epoch]:
 
 
 def raw_table(run: Run, balises: Mapping[str, tuple[int, float]] | None = None) -> FloatArray:
-    """A run as a table of epochs, (m, 19), columns as `COLUMNS`; `balises` says where balises lie: track index and offset, m.
+    """A run as a table of epochs, (m, 20), columns as `COLUMNS`; `balises` says where balises lie: track index and offset, m.
 
     Raises
     ------
@@ -173,8 +177,9 @@ def raw_table(run: Run, balises: Mapping[str, tuple[int, float]] | None = None) 
             if value is not None:
                 table[rows, _AT[name]] = value[wheel]
     if imu is not None and len(imu):
-        force, side, rate, sigma = _inertial_means(imu, time)
+        force, side, rate, sigma, rough = _inertial_means(imu, time)
         table[:, _AT["side_force"]] = side
+        table[:, _AT["sigma_force"]] = rough
         table[:, _AT["forward_force"]] = force
         table[:, _AT["yaw_rate"]] = rate
         table[:, _AT["sigma_yaw_rate"]] = sigma
@@ -192,7 +197,7 @@ def kernel_table(raw: FloatArray, frame: GridFrame, latitude: float) -> FloatArr
 
     Parameters
     ----------
-    raw : (m, 19) array
+    raw : (m, 20) array
         As `raw_table` gives it.
     frame : GridFrame
         The model's plane.
@@ -202,7 +207,7 @@ def kernel_table(raw: FloatArray, frame: GridFrame, latitude: float) -> FloatArr
 
     Returns
     -------
-    (m, 19) array
+    (m, 20) array
         Columns as in `railnav.navigation.columns`.
     """
     table = np.full((len(raw), c.EPOCH_SIZE), np.nan)
@@ -280,8 +285,8 @@ def body_from_imu(mounting: FloatArray) -> FloatArray:
     return np.asarray(z @ y @ x)
 
 
-def _inertial_means(imu: ImuStream, time: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Forward and side force, yaw rate and sigma of the latter's mean between consecutive epochs, (m,) each; NaN where not half covered."""
+def _inertial_means(imu: ImuStream, time: FloatArray) -> tuple[FloatArray, ...]:
+    """Means between epochs: forward and side force, yaw rate, sigma of the latter and of the forces; NaN where not half covered."""
     matrix = body_from_imu(imu.mounting)
     force = imu.specific_force @ matrix[0]
     side = imu.specific_force @ matrix[1]
@@ -308,5 +313,7 @@ def _inertial_means(imu: ImuStream, time: FloatArray) -> tuple[FloatArray, Float
         # differences of neighbours hold the noise but not the turn itself
         noise = 0.5 * np.diff(rate, prepend=rate[0]) ** 2
         sigma = np.sqrt(between(noise) / count / count)
+        jitter = 0.25 * (np.diff(force, prepend=force[0]) ** 2 + np.diff(side, prepend=side[0]) ** 2)
+        rough = np.sqrt(between(jitter) / count / count)
     sigma = np.where(enough & (count >= 3.0), np.maximum(sigma, 1e-6), NAN)
-    return mean_force, mean_side, mean_rate, sigma
+    return mean_force, mean_side, mean_rate, sigma, np.where(enough & (count >= 3.0), rough, NAN)

@@ -150,6 +150,9 @@ class Settings:
         vehicle body leaning on its springs adds or takes.
     balise_sigma : float
         Sigma of a balise reading where none is stated, m.
+    gnss_fault : float
+        Probability that the receiver has gone astray within the last two minutes, in a way that its fixes do not show: the protection
+        level then rests on the wheel alone since before that. 0: it is not reckoned with.
     balise_missed : float
         Probability that a balise is passed and not read.
     curvature_sigma, curvature_shift, curvature_length : float
@@ -245,6 +248,7 @@ class Settings:
     side_time: float = 1.0
     side_scale: float = 0.2
     balise_sigma: float = 0.5
+    gnss_fault: float = 1e-3
     balise_missed: float = 1e-3
     curvature_sigma: float = 2e-5
     curvature_shift: float = 0.4

@@ -30,8 +30,10 @@ def do_predict(x, P_sqrt, F, Q, lead, count, new):
 
 
 @njit
-def do_transition(fil, x, dt, sign, force, pull, slip, shake, step, tag, travel, stretch, F, Q, lead, new):
-    return dynamics.transition(fil, x, dt, sign, force, pull, slip, shake, step, tag, travel, stretch, F, Q, lead, new)
+def do_transition(fil, x, dt, sign, force, rough, pull, slip, shake, step, tag, travel, stretch, F, Q, lead, new):
+    return dynamics.transition(
+        fil, x, dt, sign, force, rough, pull, slip, shake, step, tag, travel, stretch, F, Q, lead, new
+    )
 
 
 @njit
@@ -62,7 +64,7 @@ def do_merge(bank, a, b, shift, position, column):
 
 
 def a_filter(at, settings=None, signed=0):
-    return c.Filter(at, (settings or Settings()).packed(), np.zeros(3), np.array([1e-4, 3.9]), signed)
+    return c.Filter(at, (settings or Settings()).packed(), np.zeros(3), np.array([1e-4, 3.9, 0.0]), signed)
 
 
 def a_root(rng, n):
@@ -152,7 +154,7 @@ def test_transition_is_the_derivative_of_the_prediction(streams, dt):
     F, Q, lead, new = np.empty((n, n)), np.empty((c.NOISES, n)), np.empty(c.NOISES, np.int64), np.empty(n)
 
     def step(state):
-        do_transition(fil, state, dt, 1.0, 0.4, 0.05, 0.0, 0.0, 0.0, 0.0, 7.0, 0.0, F, Q, lead, new)
+        do_transition(fil, state, dt, 1.0, 0.4, 0.0, 0.05, 0.0, 0.0, 0.0, 0.0, 7.0, 0.0, F, Q, lead, new)
         return new.copy()
 
     step(x)
@@ -173,7 +175,7 @@ def test_prediction_equals_the_dense_one(streams):
     rng = np.random.default_rng(5)
     x, P_sqrt = rng.standard_normal(n), a_root(rng, n)
     F, Q, lead, new = np.empty((n, n)), np.zeros((c.NOISES, n)), np.empty(c.NOISES, np.int64), np.empty(n)
-    count = do_transition(a_filter(at), x, 0.7, 1.0, 0.3, 0.0, 4.0, 0.1, 0.2, 0.3, 90.0, 0.5, F, Q, lead, new)
+    count = do_transition(a_filter(at), x, 0.7, 1.0, 0.3, 0.1, 0.0, 4.0, 0.1, 0.2, 0.3, 90.0, 0.5, F, Q, lead, new)
     noise = Q[:count].copy()
     dense = F @ P_sqrt @ P_sqrt.T @ F.T + noise.T @ noise
     other = P_sqrt.copy()
@@ -196,7 +198,7 @@ def test_process_noise_adds_up_over_steps():
         x, P_sqrt = np.zeros(n), 1e-9 * np.eye(n)
         F, Q, lead, new = np.empty((n, n)), np.zeros((c.NOISES, n)), np.empty(c.NOISES, np.int64), np.empty(n)
         for _ in range(steps):
-            count = do_transition(fil, x, dt, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 20.0 * dt, 0.0, F, Q, lead, new)
+            count = do_transition(fil, x, dt, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 20.0 * dt, 0.0, F, Q, lead, new)
             do_predict(x, P_sqrt, F, Q, lead, count, new)
         return P_sqrt @ P_sqrt.T
 

@@ -24,8 +24,8 @@ def do_position(fil, net, shared, bank, work, h, row):
 
 
 @njit
-def do_inertial(fil, net, bank, work, h, row, dt):
-    equations.inertial_rows(fil, net, bank, work, h, row, dt)
+def do_inertial(fil, net, shared, bank, work, h, row, dt):
+    equations.inertial_rows(fil, net, shared, bank, work, h, row, dt)
 
 
 @njit
@@ -170,7 +170,9 @@ def test_rows_of_the_inertial_sensors(engine, which):
     row = empty()
     row[[c.TIME, c.SIGMA_YAW]] = 0.0, 1e-3
     row[(c.YAW_RATE, c.SIDE)[which]] = yaw_and_side(engine)[which] + 1e-3
-    applied = row_of(engine, lambda: do_inertial(engine.filter, engine.network, engine.bank, engine.work, h, row, 0.1))
+    applied = row_of(
+        engine, lambda: do_inertial(engine.filter, engine.network, engine.shared, engine.bank, engine.work, h, row, 0.1)
+    )
     numeric = differences(engine, lambda: yaw_and_side(engine)[which], step=1e-3)
     cosine = applied @ numeric / np.linalg.norm(applied) / np.linalg.norm(numeric)
     assert cosine == pytest.approx(1.0, abs=1e-6)

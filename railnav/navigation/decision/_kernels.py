@@ -70,9 +70,10 @@ from railnav.navigation.columns import (
     SPEED,
     TIME,
     TRACKING,
+    WHEEL_DISTANCE,
 )
 from railnav.navigation.dynamics._kernels import variance_of
-from railnav.navigation.integrity._kernels import mixture_bound
+from railnav.navigation.integrity._kernels import mixture_bound, separation_bound
 from railnav.navigation.measurements._kernels import gravity_pull
 
 
@@ -228,6 +229,8 @@ def put_out(fil, net, shared, bank, work, row, out):
     probability *= 1.0 - common[C_UNSEEN]
     out[OUT_PROBABILITY] = min(probability, 1.0)
     out[OUT_LEVEL] = mixture_bound(work.mix[0], work.mix[1], work.mix[2], live, fil.risk[0], fil.risk[1])
+    if at[WHEEL_DISTANCE] >= 0:
+        out[OUT_LEVEL] = max(out[OUT_LEVEL], separation_bound(fil, bank, h, row[TIME]))
     out[OUT_DIRECTION] = way if forward >= DIRECTION_CONFIDENCE * standing else 0.0
     if probability < k[K_CONFIDENCE] or at_a_toe(fil, bank, h):
         out[OUT_MODE] = AMBIGUOUS

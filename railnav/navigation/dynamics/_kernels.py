@@ -41,10 +41,11 @@ from railnav.navigation.columns import (
 
 
 @part
-def transition(fil, x, dt, sign, force, pull, slip, shake, step, tag, travel, stretch, F, Q, lead, new):
+def transition(fil, x, dt, sign, force, rough, pull, slip, shake, step, tag, travel, stretch, F, Q, lead, new):
     """Fill the transition matrix F (lower triangular), the noise columns Q with their first rows and the predicted state (19.2).
 
-    `sign` is the direction in which an unsigned odometer counts, `pull` is g sin(grade); the variances slip, shake, step and tag
+    `sign` is the direction in which an unsigned odometer counts, `pull` is g sin(grade), `rough` the
+    sigma of the force; the variances slip, shake, step and tag
     forget the wheel distance, shake the speed, and let the GNSS error and its time stamps jump; over `travel` metres the model's error
     across changes, and `stretch` is the variance of what the model's length is wrong by there. Gives the number of noise columns.
     """
@@ -175,6 +176,8 @@ def transition(fil, x, dt, sign, force, pull, slip, shake, step, tag, travel, st
             c += 1
     else:  # white acceleration, integrated twice
         q = (k[K_FORCE_NOISE] if accelerometer else SILENT_NOISE) * root
+        if accelerometer and rough == rough:
+            q = math.sqrt(q * q + (rough * dt) ** 2)
         for m in range(2):
             for j in range(n):
                 Q[c, j] = 0.0

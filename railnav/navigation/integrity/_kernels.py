@@ -1,10 +1,74 @@
-"""Protection level of a mixture of normal hypotheses (specification 22). No validation."""
+"""Protection levels (specification 22): of a mixture of normal hypotheses, and by solution separation. No validation."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
+
+from railnav.matching._kernels import (
+    CHECK,
+    CHECK_PLACE,
+    CHECK_SCALE,
+    CHECK_SCALE_VARIANCE,
+    CHECK_SIZE,
+    CHECK_TIME,
+    CHECK_VARIANCE,
+    CHECK_WHEEL,
+    SIGN,
+    part,
+)
+from railnav.navigation.columns import (
+    CHECK_INTERVAL,
+    K_ODOMETER_SLIP,
+    ODOMETER_SCALE,
+    POSITION,
+    WHEEL_DISTANCE,
+)
+from railnav.navigation.dynamics._kernels import variance_of
+
+
+@part
+def keep_check(fil, bank, h, time, slipping):
+    """Let dead reckoning by the wheel begin anew, once a minute; after a slip both beginnings are void."""
+    at = fil.at
+    info = bank.info[h]
+    if slipping:
+        info[CHECK + CHECK_TIME] = np.inf
+        info[CHECK + CHECK_SIZE + CHECK_TIME] = np.inf
+    newer = CHECK + CHECK_SIZE
+    if time - info[newer + CHECK_TIME] < CHECK_INTERVAL:
+        return
+    i_s, i_d, i_k = at[POSITION], at[WHEEL_DISTANCE], at[ODOMETER_SCALE]
+    for j in range(CHECK_SIZE):
+        info[CHECK + j] = info[newer + j]
+    info[newer + CHECK_TIME] = time
+    info[newer + CHECK_PLACE] = bank.x[h, i_s]
+    info[newer + CHECK_WHEEL] = bank.x[h, i_d]
+    info[newer + CHECK_SCALE] = bank.x[h, i_k]
+    info[newer + CHECK_VARIANCE] = variance_of(bank.P_sqrt[h], i_s)
+    info[newer + CHECK_SCALE_VARIANCE] = variance_of(bank.P_sqrt[h], i_k)
+
+
+@part
+def separation_bound(fil, bank, h, time):
+    """Bound by solution separation (22): how far the filter lies from dead reckoning that has used no fix for one to two minutes.
+
+    PL = |s - s_0| + K sigma_0, K the two-sided quantile at the risk over the probability of such a fault; 0 where there is none.
+    """
+    info = bank.info[h]
+    begun = info[CHECK + CHECK_TIME]
+    if not -np.inf < begun < time or fil.risk[2] <= 0.0:
+        return 0.0
+    k = fil.settings
+    way = (bank.x[h, fil.at[WHEEL_DISTANCE]] - info[CHECK + CHECK_WHEEL]) / (1.0 + info[CHECK + CHECK_SCALE])
+    if bank.tags[h, SIGN] < 0 and fil.signed == 0:
+        way = -way
+    apart = abs(bank.x[h, fil.at[POSITION]] - info[CHECK + CHECK_PLACE] - way)
+    variance = info[CHECK + CHECK_VARIANCE] + info[CHECK + CHECK_SCALE_VARIANCE] * way * way
+    variance += k[K_ODOMETER_SLIP] ** 2 * abs(way)
+    return apart + fil.risk[2] * math.sqrt(variance)
 
 
 @njit(cache=True)

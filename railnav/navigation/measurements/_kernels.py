@@ -46,17 +46,26 @@ from railnav.navigation.columns import (
     BALISE_TRACK,
     BEND_CHANGE,
     BLIND_LENGTH,
+    C_ACCELEROMETER_FAULTS,
+    C_BLAMED,
+    C_DISTRUST,
+    C_GNSS_SPEED,
+    C_GNSS_SPEED_TIME,
+    C_ODOMETER_FAULTS,
+    C_RESCALED,
     C_RING,
     C_SCALE,
     C_SIGMA_EAST,
     C_SIGMA_NORTH,
     C_SLIPS,
     C_SPEED_STALE,
+    C_YAW_DISTRUST,
     COURSE_EAST,
     COURSE_NORTH,
     DISTANCE,
     EAST,
     FORCE,
+    FORCE_STEP,
     FORGET_WHEEL,
     FRAME_EAST,
     FRAME_NORTH,
@@ -96,11 +105,14 @@ from railnav.navigation.columns import (
     POSITION,
     RING,
     ROW_GATE,
+    S_YAW,
+    SCALE_STEP,
     SHAKE_SPEED,
     SIDE,
     SIDE_BIAS,
     SIGMA_BALISE,
     SIGMA_EAST,
+    SIGMA_FORCE,
     SIGMA_NORTH,
     SIGMA_SPEED,
     SIGMA_WHEEL,
@@ -197,6 +209,21 @@ def ring_speed(ring, latest, time, distance):  # odometer readings, index after 
 
 
 @part
+def second_opinion(shared, time, speed):
+    """Whether the receiver's speed is fresh and agrees with a speed."""
+    common = shared.common
+    fresh = common[C_GNSS_SPEED_TIME] > time - 1.5 and common[C_SPEED_STALE] == 0.0 and time > common[C_DISTRUST]
+    return fresh and common[C_GNSS_SPEED] > 1.0 and abs(common[C_GNSS_SPEED] - speed) < 0.3 + 0.01 * speed
+
+
+@part
+def against_speed(shared, time, wheel, speed):
+    """Whether wheel and receiver agree with each other and not with the filter's speed."""
+    told = shared.common[C_GNSS_SPEED]
+    return second_opinion(shared, time, abs(wheel)) and abs(told - abs(speed)) > 0.7 + 2.0 * abs(told - abs(wheel))
+
+
+@part
 def wheel_row(fil, shared, bank, work, h, row, leader):
     """Odometer distance: a slipping wheel is forgotten until it agrees with the speed again. Gives ln p, slip and shake variances.
 
@@ -237,9 +264,21 @@ def wheel_row(fil, shared, bank, work, h, row, leader):
             info[AGREE_SINCE] = bank.info[leader, AGREE_SINCE]
     elif info[SLIP_SINCE] == -np.inf:
         begins = abs(innovation) > k[K_SLIP_GATE] * math.sqrt(s) or differs
+    elif at[ACCELEROMETER_BIAS] >= 0 and span > 0.0 and against_speed(shared, time, wheel, x[i_v]):
+        begins = False  # wheel and receiver agree: it is the accelerometer that is wrong
+        info[SLIP_SINCE] = -np.inf
+        info[AGREE_SINCE] = np.inf
+        shared.common[C_ACCELEROMETER_FAULTS] += 1.0
+        shared.common[C_BLAMED] = time
     else:
         begins = False
         longest = time - info[SLIP_SINCE] > k[K_SLIP_LONGEST]
+        if longest and second_opinion(shared, time, abs(x[i_v])):
+            longest = False  # the receiver confirms the speed: another wheel, or a dead one
+            info[SLIP_SINCE] = -np.inf
+            info[AGREE_SINCE] = np.inf
+            shared.common[C_ODOMETER_FAULTS] += 1.0
+            shared.common[C_RESCALED] = time
         if longest:
             info[SLIP_SINCE] = -np.inf
             info[AGREE_SINCE] = -np.inf
@@ -263,6 +302,12 @@ def wheel_row(fil, shared, bank, work, h, row, leader):
         widen(P_sqrt, i_v, math.sqrt(shake), column)
         if i_a >= 0:
             widen(P_sqrt, i_a, KICK, column)
+    if shared.common[C_BLAMED] == time:
+        shake = (0.1 + abs(wheel - abs(x[i_v]))) ** 2
+        widen(P_sqrt, i_v, math.sqrt(shake), column)
+        widen(P_sqrt, at[ACCELEROMETER_BIAS], FORCE_STEP, column)
+    if shared.common[C_RESCALED] == time:
+        widen(P_sqrt, at[ODOMETER_SCALE], SCALE_STEP, column)
     slip = 0.0
     evidence = -0.5 * (min(innovation * innovation / s, ROW_GATE) + math.log(s))
     if info[SLIP_SINCE] > -np.inf:
@@ -295,7 +340,7 @@ def wheel_speed_row(fil, bank, work, h, row):
 
 
 @part
-def inertial_rows(fil, net, bank, work, h, row, dt):
+def inertial_rows(fil, net, shared, bank, work, h, row, dt):
     """Yaw rate and specific force to the right, linearised statistically over the position's spread (five-point Gauss-Hermite).
 
     omega_z = v bend + b_g + tilt v phi', f_y = v^2 bend - g lean + b_y with bend = kappa cos(alpha) cos(phi) - kappa_v sin(phi) and
@@ -346,7 +391,7 @@ def inertial_rows(fil, net, bank, work, h, row, dt):
     # where the model does not know where the track lies (a bridged tunnel) it does not know how it bends either
     poor = probe[P_SIGMA_CROSS] / (BLIND_LENGTH * BLIND_LENGTH)
     rough += poor * poor * max(1.0, BLIND_LENGTH / max(abs(v) * dt, 0.1))
-    if row[YAW_RATE] == row[YAW_RATE]:
+    if row[YAW_RATE] == row[YAW_RATE] and row[TIME] >= shared.common[C_YAW_DISTRUST]:
         moving = min(1.0, abs(v) / 2.0)
         variance = (
             row[SIGMA_YAW] ** 2
@@ -361,6 +406,7 @@ def inertial_rows(fil, net, bank, work, h, row, dt):
         # tracks side by side differ in curvature by less than a model is wrong: only a turnout's difference is evidence
         doubt = project(P_sqrt, h_row, f) + variance + (v * k[K_CURVATURE_DOUBT]) ** 2
         credit(bank, h, BY_YAW, -0.5 * (min(innovation * innovation / doubt, ROW_GATE) + math.log(doubt)))
+        work.slot[h, S_YAW] = innovation * innovation / (doubt - (v * k[K_CURVATURE_DOUBT]) ** 2)
         robust_row(x, P_sqrt, h_row, innovation, variance, f, keep, move)
         h_row[i_g] = 0.0
         h_row[i_t] = 0.0
@@ -370,6 +416,8 @@ def inertial_rows(fil, net, bank, work, h, row, dt):
         sway = k[K_SIDE_NOISE] * min(1.0, 0.1 + abs(v) / 5.0)
         variance = sway * sway * max(1.0, k[K_SIDE_TIME] / dt) + v**4 * (rest + rough) + k[K_GRAVITY] ** 2 * lean_rest
         variance += (k[K_SIDE_SCALE] * said) ** 2 * alike
+        if row[SIGMA_FORCE] == row[SIGMA_FORCE]:
+            variance += row[SIGMA_FORCE] ** 2
         h_row[i_s] = v * v * slope - k[K_GRAVITY] * lean_slope
         h_row[i_v] = 2.0 * v * mean
         h_row[i_y] = 1.0
@@ -461,6 +509,16 @@ def speed_rows(fil, bank, work, h, row):
         credit(bank, h, BY_SPEED, robust_row(x, P_sqrt, h_row, -v, speed * speed + sigma * sigma, f, keep, move))
         h_row[i_v] = 0.0
         return
+    certain = v * v > 25.0 * variance_of(P_sqrt, i_v) and abs(v) > 3.0
+    if (
+        course_east == course_east
+        and certain
+        and v * (course_east * point[P_D_EAST] + course_north * point[P_D_NORTH]) < 0.0
+    ):
+        credit(
+            bank, h, BY_COURSE, -0.5 * ROW_GATE
+        )  # a train does not turn at speed: the course is wrong, or the hypothesis
+        return
     if course_east == course_east:
         sign = 1.0 if course_east * point[P_D_EAST] + course_north * point[P_D_NORTH] > 0.0 else -1.0
     elif fil.signed == 0:
@@ -529,7 +587,7 @@ def motion_rows(fil, net, shared, bank, work, h, row, dt, still):
         credit(bank, h, BY_STANDSTILL, rest)
         h_row[i_v] = 0.0
     if at[GYRO_BIAS] >= 0 and dt > 0.0 and (row[YAW_RATE] == row[YAW_RATE] or row[SIDE] == row[SIDE]):
-        inertial_rows(fil, net, bank, work, h, row, dt)
+        inertial_rows(fil, net, shared, bank, work, h, row, dt)
     if row[BALISE_TRACK] >= 0.0:
         balise_row(fil, net, bank, work, h, row)
     if fil.reads_balises == 1:

@@ -27,6 +27,7 @@ from railnav.navigation.columns import (
     R_TAG,
     R_TRAVEL,
     R_VERSION,
+    SIGMA_FORCE,
     SPEED,
     TIME,
 )
@@ -92,6 +93,7 @@ def _compiled(stamp: int) -> Any:
                     dt,
                     numbers[R_SIGN],
                     epochs[e + 1, FORCE],
+                    epochs[e + 1, SIGMA_FORCE],
                     numbers[R_PULL],
                     numbers[R_SLIP],
                     numbers[R_SHAKE],

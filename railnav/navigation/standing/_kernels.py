@@ -15,6 +15,10 @@ from railnav.navigation.columns import (
     C_GNSS_SPEED,
     C_GNSS_SPEED_TIME,
     C_GNSS_STILL,
+    C_LAST_FORCE,
+    C_LAST_SIDE,
+    C_LAST_YAW,
+    C_REPEATED,
     C_RING,
     C_SIGMA_EAST,
     C_SIGMA_NORTH,
@@ -34,6 +38,7 @@ from railnav.navigation.columns import (
     PULLS,
     RING,
     S_SHAKE,
+    SIDE,
     SIGMA_EAST,
     SIGMA_NORTH,
     SIGMA_SPEED,
@@ -41,6 +46,7 @@ from railnav.navigation.columns import (
     TIME,
     W_COLUMN,
     WHEEL_SPEED,
+    YAW_RATE,
 )
 from railnav.navigation.dynamics._kernels import variance_of, widen
 
@@ -98,6 +104,20 @@ def heaviest(bank):
         if bank.logw[bank.live[1 + i]] > bank.logw[best]:
             best = bank.live[1 + i]
     return best
+
+
+@part
+def hold_repeated(fil, shared, bank, row):
+    """Take out of a moving train's epoch the inertial means that repeat the ones before to the last digit: a frozen or saturated axis."""
+    common = shared.common
+    moving = bank.live[0] > 0 and abs(bank.x[heaviest(bank), fil.at[SPEED]]) > 1.0
+    for column, last in ((FORCE, C_LAST_FORCE), (SIDE, C_LAST_SIDE), (YAW_RATE, C_LAST_YAW)):
+        value = row[column]
+        if value == value:
+            if moving and value == common[last]:
+                row[column] = np.nan
+                common[C_REPEATED] += 1.0
+            common[last] = value
 
 
 @part
