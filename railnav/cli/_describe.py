@@ -95,6 +95,10 @@ def _cross_sigma(model: TrackModel) -> Any:
     return np.sqrt(np.maximum(variance, 0.0))
 
 
+#: More tracks than these are counted; JSON lists all.
+MOST_TRACKS = 60
+
+
 def print_model(facts: dict[str, Any], title: str) -> None:
     """Print what `describe_model` found."""
     kinds = {kind: many for kind, many in facts["nodes"].items() if many}
@@ -127,10 +131,12 @@ def print_model(facts: dict[str, Any], title: str) -> None:
                 track["start_node"],
                 track["end_node"],
             )
-            for track in facts["tracks"]
+            for track in facts["tracks"][:MOST_TRACKS]
         ],
         left=3,
     )
+    if len(facts["tracks"]) > MOST_TRACKS:
+        click.echo(f"  and {len(facts['tracks']) - MOST_TRACKS:,} more tracks; --json lists them all")
 
 
 def _maker(provenance: dict[str, Any]) -> str:

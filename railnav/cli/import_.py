@@ -56,7 +56,7 @@ def command(
     """  # noqa: D301
     from railnav.cli import _files
     from railnav.cli._describe import describe_model, print_model
-    from railnav.cli._terminal import print_json
+    from railnav.cli._terminal import print_json, print_warnings
     from railnav.cli._verb import frame_request
     from railnav.errors import InputError
 
@@ -108,6 +108,7 @@ def command(
     if as_json:
         print_json({**facts, "output": output})
     else:
+        print_warnings(model.provenance.get("import", {}).get("notes", []))
         print_model(facts, f"{output} written")
 
 

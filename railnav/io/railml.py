@@ -209,7 +209,7 @@ def _read(
     sections = [_section(reader, frame, element, geographic, spacing) for element in elements.values()]
     model = assemble(frame, sections, join_within=JOIN_WITHIN)
     index = {element: i for i, element in enumerate(elements)}
-    related = any(local_name(node) == "netRelation" for node in infrastructure.iter())
+    related = any(local_name(node) == "netRelations" for node in infrastructure.iter())
     movements = _movements(reader, infrastructure, index) if related else model.movements
     if not related and len(sections) > 1:
         reader.note("there are no netRelations; movements follow from the tangents")
@@ -407,7 +407,8 @@ def _along(reader: _Reader, infrastructure: Any, elements: dict[str, _Element]) 
             for place in children(location, "associatedNetElement")
         ]
         if kind in ("line", "track"):
-            name = next((str(child.get("name", "")) for child in children(node, "name")), "") or str(node.get("id", ""))
+            name = next((str(child.get("name", "")) for child in children(node, "name")), "")
+            name = name or (str(node.get("id", "")) if kind == "line" else "")
             for place in places:
                 element = elements.get(str(place.get("netElementRef")))
                 if element is not None and kind == "line":

@@ -92,6 +92,7 @@ def test_a_model_comes_back_within_a_millimetre(tmp_path):
     again = read_railml(tmp_path / "line.railml")
     assert again.track_id == model.track_id
     assert again.line == model.line
+    assert again.name == model.name
     for was, now in zip(model.provenance.get("balises", []), again.provenance["balises"], strict=True):
         assert (was["id"], was["track"]) == (now["id"], now["track"])
         assert now["offset_m"] == pytest.approx(was["offset_m"], abs=1e-3)
