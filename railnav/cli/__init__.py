@@ -41,8 +41,11 @@ VERBS: dict[str, tuple[str, str]] = {
         "Measure the noise of an inertial unit at rest: Allan deviation, drawn, and the parameters that explain it.",
     ),
     "simulate": ("simulate", "Simulate a run over a model, with its truth."),
-    "alignment": ("alignment", "Fit straights, transitions, arcs, gradients and cant ramps to a measured axis."),
-    "draw": ("draw", "Draw plan, curvature, cant and gradient diagrams of a model or a design."),
+    "alignment": (
+        "alignment",
+        "Fit straights, transitions, arcs, gradients, vertical curves and cant ramps to a model's tracks.",
+    ),
+    "draw": ("draw", "Draw plan, curvature, cant and gradient along chainage, as engineers know them."),
     "info": ("info", "Describe a model, a run or a solution."),
     "validate": ("validate", "Check a model or a run and report every defect at once."),
     "datum": ("datum", "List datums, compare and pin their transformations, and fit one to common points."),
