@@ -55,8 +55,9 @@ def command(
     from railnav.cli import _files
     from railnav.cli._terminal import print_facts, print_json, print_table
     from railnav.errors import InputError, TrackError
-    from railnav.track.chainage import find_chainage, published, references_from_posts
+    from railnav.track.chainage import find_chainage, published
     from railnav.track.chainage_notation import format_chainage, parse_chainage
+    from railnav.track.posts import references_from_posts, spread_references
 
     if (posts or kilometres is not None) != (output is not None):
         raise click.UsageError("--posts or --kilometres make line references, and -o says where the model goes")
@@ -69,12 +70,12 @@ def command(
         _files.check_output(output, (".gpkg",), inputs=inputs)
     model = _files.read_model(model_file)
     if not len(model.references):
-        model = replace(model, references=references_from_posts(model))
+        model = replace(model, references=spread_references(model, references_from_posts(model)))
         if posts and not len(model.references):
             raise InputError("has no mile posts", file=model_file, remedy="give a table by --kilometres")
     if kilometres is not None:
         from railnav.io.line_references import read_kilometres
-        from railnav.track.chainage import with_kilometres
+        from railnav.track.posts import with_kilometres
 
         model = replace(
             model, references=with_kilometres(model.references, read_kilometres(kilometres, stretched=stretched))

@@ -303,7 +303,7 @@ class TrackPlace:
     rising: bool
 
 
-def _along(x: FloatArray, y: FloatArray, at: FloatArray) -> FloatArray:
+def along_anchors(x: FloatArray, y: FloatArray, at: FloatArray) -> FloatArray:
     """Linear between anchors, metre for metre beyond them; x grows, y grows or falls."""
     sense = 1.0 if y[-1] >= y[0] else -1.0
     beyond = np.minimum(at - x[0], 0.0) + np.maximum(at - x[-1], 0.0)
@@ -339,7 +339,7 @@ def published(model: TrackModel, track: str, offset: float) -> list[Published]:
     for i, line, here in references.stretches():
         if i == index:
             x, y = references.offset[here], references.position[here]
-            s = float(_along(x, y, np.array([offset]))[0])
+            s = float(along_anchors(x, y, np.array([offset]))[0])
             found.append(Published(references.lines[line].line, references.lines[line].address(s), bool(y[-1] >= y[0])))
     return found
 
@@ -377,106 +377,7 @@ def find_chainage(model: TrackModel, line: str, address: ChainageAddress) -> lis
             continue
         x, y = references.offset[here], references.position[here]
         rising = bool(y[-1] >= y[0])
-        offset = float(_along(y if rising else y[::-1], x if rising else x[::-1], np.array([s]))[0])
+        offset = float(along_anchors(y if rising else y[::-1], x if rising else x[::-1], np.array([s]))[0])
         if -1e-3 <= offset <= float(model.lengths[i]) + 1e-3:
             places.append(TrackPlace(model.track_id[i], min(max(offset, 0.0), float(model.lengths[i])), rising))
     return places
-
-
-def references_from_posts(model: TrackModel) -> LineReferences:
-    """Line references from the posts of a model: stretched kilometres, each as long as the tracks measure it.
-
-    Parameters
-    ----------
-    model : TrackModel
-        With mile posts; posts of tracks without a line's name belong to the line "".
-
-    Returns
-    -------
-    LineReferences
-        Positions are the published chainage in metres and every kilometre counts 1000: where tracks beside each other differ in
-        length both keep their posts. A track whose posts contradict themselves (neither growing nor falling) is left out.
-
-    Examples
-    --------
-    >>> import railnav
-    >>> model = railnav.demo_line()
-    >>> references = references_from_posts(model)
-    >>> len(references) > 0
-    True
-    """
-    posts = model.mileposts
-    names = list(dict.fromkeys(model.line[i] for i in posts.track.tolist()))
-    kept: list[tuple[int, int, FloatArray, FloatArray]] = []
-    for i in np.unique(posts.track).tolist():
-        here = slice(*np.searchsorted(posts.track, [i, i + 1]))
-        x, y = posts.offset[here], posts.chainage[here]
-        step = np.diff(y)
-        if len(x) and (np.diff(x) > 0).all() and ((step > 0).all() or (step < 0).all()):
-            kept.append((i, names.index(model.line[i]), x, y))
-    lines: list[LineReference] = []
-    place: dict[int, int] = {}
-    for number, name in enumerate(names):
-        own = [(x, y) for _, line, x, y in kept if line == number]
-        if not own:
-            continue
-        low, high = min(float(y.min()) for _, y in own), max(float(y.max()) for _, y in own)
-        first, last = int(np.floor(low / 1000.0)), max(int(np.ceil(high / 1000.0)), int(np.floor(low / 1000.0)) + 1)
-        label = np.arange(first, last)
-        place[number] = len(lines)
-        lines.append(
-            LineReference(
-                name, label, 1000.0 * np.arange(first, last + 1, dtype=np.float64), np.full(len(label), 1000.0)
-            )
-        )
-    rows = [(i, place[line], x, y) for i, line, x, y in kept if line in place]
-    if not rows:
-        return LineReferences(tuple(lines))
-    return LineReferences(
-        tuple(lines),
-        np.concatenate([np.full(len(x), i) for i, _, x, _ in rows]).astype(np.int64),
-        np.concatenate([np.full(len(x), line) for _, line, x, _ in rows]).astype(np.int64),
-        np.concatenate([x for *_, x, _ in rows]),
-        np.concatenate([y for *_, y in rows]),
-    )
-
-
-def with_kilometres(references: LineReferences, tables: Sequence[LineReference]) -> LineReferences:
-    """Give lines the kilometres of a table in place of those that posts suggest; anchors keep their published address.
-
-    Parameters
-    ----------
-    references : LineReferences
-        With anchors on tracks, as `references_from_posts` makes them.
-    tables : sequence of LineReference
-        Lines by name; a single one without a name is that of the only line.
-
-    Returns
-    -------
-    LineReferences
-        Each anchor's address under the old kilometres has the position that the new ones give it.
-
-    Raises
-    ------
-    TrackError
-        A line that has no anchor, or an address that the table does not have.
-    """
-    names = [line.line for line in references.lines]
-    lines, position = list(references.lines), references.position.copy()
-    for table in tables:
-        name = names[0] if not table.line and len(names) == 1 else table.line
-        if name not in names:
-            raise TrackError(
-                f"no posts of line {name!r}; there are posts of {', '.join(map(repr, names)) or 'no line'}"
-            )
-        number = names.index(name)
-        here = references.line == number
-        label, metre = references.lines[number].addresses(references.position[here])
-        try:
-            position[here] = table.positions(label, metre)
-        except TrackError as error:
-            raise TrackError(f"a post of line {name!r} has no place in the table: {error}") from error
-        lines[number] = LineReference(name, table.label.copy(), table.start.copy(), table.counted.copy(), table.unit)
-    return LineReferences(
-        tuple(lines), references.track.copy(), references.line.copy(), references.offset.copy(), position
-    )

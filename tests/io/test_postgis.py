@@ -21,8 +21,8 @@ from railnav.errors import ModelError, RailnavError
 from railnav.geodesy import choose_frame
 from railnav.io import postgis
 from railnav.io.store_address import is_store, store_address
-from railnav.track.chainage import references_from_posts
 from railnav.track.model import TrackModel
+from railnav.track.posts import references_from_posts
 
 psycopg = pytest.importorskip("psycopg", reason="psycopg is not installed (extra stores)")
 

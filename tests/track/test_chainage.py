@@ -24,10 +24,9 @@ from railnav.track.chainage import (
     LineReferences,
     find_chainage,
     published,
-    references_from_posts,
-    with_kilometres,
 )
 from railnav.track.chainage_notation import format_chainage, parse_chainage
+from railnav.track.posts import references_from_posts, spread_references, with_kilometres
 
 kilometres = st.lists(st.floats(5.0, 2500.0), min_size=1, max_size=30)
 
@@ -214,6 +213,31 @@ def test_chainage_and_place_are_exact_inverses(model, data):
         mine = [p for p in places if p.track == model.track_id[track]]
         assert mine
         assert min(abs(p.offset - offset) for p in mine) < 1e-6
+
+
+def test_tracks_without_posts_get_theirs_from_both_sides(model):
+    """Posts of every third main track are taken away: what is spread agrees with what they said, within a metre."""
+    full = references_from_posts(model)
+    mains = [i for i, name in enumerate(model.track_id) if name.startswith("77R-")]
+    gone = set(mains[1:-1:3])
+    posts = model.mileposts
+    keep = np.array([i not in gone for i in posts.track.tolist()])
+    fewer = replace(model, mileposts=type(posts)(posts.track[keep], posts.offset[keep], posts.chainage[keep]))
+    spread = spread_references(fewer, references_from_posts(fewer))
+    spread_model = replace(fewer, references=spread)
+    compared = 0
+    for i in gone:
+        name, middle = model.track_id[i], float(model.lengths[i]) / 2
+        (truth,) = published(replace(model, references=full), name, middle)
+        said = published(spread_model, name, middle)
+        if not said:
+            continue  # the chainage jumps on it: its length contradicts the line, and it stays without
+        compared += 1
+        away = (said[0].address.label - truth.address.label) * 1000.0 + said[0].address.metre - truth.address.metre
+        assert abs(away) < 1.0
+        assert said[0].rising == truth.rising
+    assert compared >= len(gone) - 1
+    assert spread_references(model, full) is not None
 
 
 def test_several_lines_over_one_track(model):
