@@ -39,6 +39,8 @@ FLOOR = 2e-5
 LEAST_WALK = 2e-6
 #: A slope this many white sigma off the running median of so many nodes, and at least so far, rad, is a gross error.
 SLIP_RATIO, SLIP_NODES, LEAST_SLIP = 10.0, 31, 2e-3
+#: More good fixes than this between two of a track: the run was elsewhere meanwhile.
+MOST_OTHERS = 5
 #: A gap in the angles longer than this is not interpolated, s.
 LONGEST_GAP = 2.0
 
@@ -63,6 +65,10 @@ def along_at(fixes: Fixes, offset: FloatArray, sense: int, time: FloatArray) -> 
         return out
     t, s = fixes.time[use], offset[use]
     inside = (time >= t[0]) & (time <= t[-1])
+    # where the run has good fixes that are not of this track it was on another one
+    others = np.append(0, np.cumsum((fixes.reason == USED) & ~np.isfinite(offset)))
+    between = np.diff(others[use])
+    inside &= ~(np.append(between, 0) > MOST_OTHERS)[np.clip(np.searchsorted(t, time, side="right") - 1, 0, len(t) - 1)]
     odometer = fixes.odometer
     if odometer is None or odometer[0][0] > t[0] + 1.0 or odometer[0][-1] < t[-1] - 1.0:
         out[inside] = np.interp(time[inside], t, s)

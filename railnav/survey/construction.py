@@ -19,9 +19,10 @@ from railnav.survey import report, surveyed
 from railnav.survey.angles import slopes_of
 from railnav.survey.axis import solve, sweep
 from railnav.survey.fixes import Fixes, gather
-from railnav.survey.grouping import tracks_of_line
+from railnav.survey.joining import join_tracks
+from railnav.survey.layout import COARSE_STEP, Join, lay_out
 from railnav.survey.noise import error_models, run_models
-from railnav.survey.nominal import course, lines, smooth_course
+from railnav.survey.nominal import course
 from railnav.survey.offsets import Offsets, differences, settle
 from railnav.survey.stored import keep_build
 from railnav.survey.surveyed import Surveyed
@@ -37,12 +38,8 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-#: Distance between nodes while the lie of the runs is not known, m.
-COARSE_STEP = 20.0
 #: Smoothing of the first nominal curves (Gaussian sigma), m.
 SMOOTHING = (40.0, 20.0)
-#: Reach of the first nominal curve, m: two tracks of a line part this far at most.
-LINE_REACH = 150.0
 #: What runs may be off before anything is known of them, m.
 FIRST_SPREAD = 20.0
 #: Estimations; the first `RELAID` of them each give a new nominal curve.
@@ -126,14 +123,14 @@ def build(
     _refuse_strangers(runs)
     frame = _frame(runs, crs, zone_width, ellipsoid)
     survey = gathered(runs, frame, tell)
-    tracks = _laid_out(survey)
+    tracks, joins = lay_out(survey)
     tell("lay out", 1, 1)
     tracks, offsets = _compared(survey, tracks)
     tell("compare", 1, 1)
     tracks, offsets = _estimated(survey, tracks, offsets, tell)
     heights, up = estimate_heights(tracks, survey.receivers, survey.kind, survey.stated_up)
     survey.settle_reasons(tracks)
-    return _assembled(survey, tracks, offsets, heights, up, frame, spacing, tell)
+    return _assembled(survey, tracks, joins, offsets, heights, up, frame, spacing, tell)
 
 
 def _silent(stage: str, done: int, total: int) -> None:
@@ -209,31 +206,6 @@ def gathered(runs: Sequence[Run], frame: GridFrame, tell: Progress) -> report.Su
     return report.Survey(fixes, courses, refused)
 
 
-def _laid_out(survey: report.Survey) -> list[Surveyed]:
-    """Sort runs into lines and tracks, and lay each track's runs along its line's first nominal curve."""
-    fixes = survey.fixes
-    tracks: list[Surveyed] = []
-    for line in lines(survey.courses):
-        members = tuple(line.members)
-        nominal = smooth_course(line.course, COARSE_STEP, SMOOTHING[0])
-        whole = surveyed.lay("", members, fixes, nominal, reach=LINE_REACH)
-        if whole.laid[0].sense < 0:  # offsets grow as the first run went
-            nominal = nominal.reversed()
-            whole = surveyed.lay("", members, fixes, nominal, reach=LINE_REACH)
-        groups, warnings = tracks_of_line(
-            whole.profile.right,
-            whole.design,
-            [fixes[i].run.direction for i in members],
-            [t.sense for t in whole.laid],
-            [fixes[i].run.id for i in members],
-        )
-        survey.warnings += warnings
-        for group in groups:
-            who = tuple(members[i] for i in group)
-            tracks.append(surveyed.lay(survey.name_track(who, tracks), who, fixes, nominal, reach=LINE_REACH))
-    return [t for t in tracks if t.profile.present.any()]
-
-
 def _compared(survey: report.Survey, tracks: list[Surveyed]) -> tuple[list[Surveyed], Offsets]:
     """From differences between runs alone: frame offsets, error models, and a nominal curve along the middle of each track."""
     kinds = len(survey.receiver_names)
@@ -306,6 +278,7 @@ def _estimated(
 def _assembled(
     survey: report.Survey,
     tracks: list[Surveyed],
+    joins: list[Join],
     offsets: Offsets,
     heights: list[Heights | None],
     up: Offsets | None,
@@ -314,7 +287,7 @@ def _assembled(
     tell: Progress,
 ) -> TrackModel:
     """Tabulate the axes by true ground length and put the model together."""
-    from railnav.track.assembly import TrackSection, assemble
+    from railnav.track.assembly import assemble
 
     tables: list[KnotTable] = []
     for i, (t, h) in enumerate(zip(tracks, heights, strict=True)):
@@ -333,8 +306,15 @@ def _assembled(
             )
         )
     tell("tabulate", len(tracks), len(tracks))
-    sections = [TrackSection(t.name, table) for t, table in zip(tracks, tables, strict=True)]
+    sections, parts = join_tracks([t.name for t in tracks], tables, joins)
     text = report.compose(survey, tracks, offsets, heights, up, tables)
+    if joins:
+        text["parts"] = parts
+        text["warnings"].append(
+            f"runs part in {len(joins)} places: turnouts were made there, and their tracks meet in nodes; such a model carries no survey "
+            "records, build it from all runs when there are new ones"
+        )
+        return assemble(frame, sections, join_within=0.05, provenance={"made_by": "railnav build", "build": text})
     records = keep_build(survey, tracks, offsets, heights, up)
     provenance = {"made_by": "railnav build", "build": text}
     return assemble(frame, sections, provenance=provenance, record_source=lambda: records)

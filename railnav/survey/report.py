@@ -116,11 +116,15 @@ class Survey:
         """Say of the fixes that no track took why: far away, or beyond its end."""
         from scipy.spatial import cKDTree
 
+        taken: dict[int, BoolArray] = {}
+        for t in tracks:
+            for i, laid in zip(t.runs, t.laid, strict=True):
+                taken[i] = taken.get(i, np.zeros(len(laid.fixes), np.bool_)) | np.isfinite(laid.offset)
         for t in tracks:
             tree = None
-            for laid in t.laid:
+            for i, laid in zip(t.runs, t.laid, strict=True):
                 f = laid.fixes
-                lost = np.flatnonzero((f.reason == USED) & ~np.isfinite(laid.offset))
+                lost = np.flatnonzero((f.reason == USED) & ~taken[i])
                 if not len(lost):
                     continue
                 if tree is None:
@@ -140,8 +144,12 @@ def compose(
     tables: Sequence[KnotTable],
 ) -> dict[str, Any]:
     """Write the report of a build as JSON values."""
-    home = {i: (t, k, table) for t, table in zip(tracks, tables, strict=True) for k, i in enumerate(t.runs)}
+    home: dict[int, tuple[Surveyed, int, KnotTable]] = {}
+    for t, table in sorted(zip(tracks, tables, strict=True), key=lambda item: len(item[0].nominal)):
+        home.update({i: (t, k, table) for k, i in enumerate(t.runs)})  # the longest track that a run follows
     runs = [_run(survey, i, home.get(i), offsets, up) for i in range(len(survey.fixes))]
+    for i, entry in enumerate(runs):
+        entry["tracks"] = [t.name for t in tracks if i in t.runs]
     runs += [_refused(run, cause) for run, cause in survey.refused]
     receivers = _receivers(survey, offsets)
     datum = _datum(survey, offsets)

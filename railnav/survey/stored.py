@@ -58,7 +58,8 @@ def keep_axis(estimate: Estimate, border_covariance: FloatArray, M: FloatArray, 
 
 def keep_borders(tracks: Sequence[str], receivers: Sequence[str], mean: FloatArray, covariance: FloatArray) -> Borders:
     """Rows that hold what is known of the frame offsets of tracks and receivers."""
-    W = inverse_root(0.5 * (covariance + covariance.T))
+    # two tracks of the same runs have the same offset: what sets them apart is held at 10 micrometres
+    W = inverse_root(0.5 * (covariance + covariance.T) + 1e-10 * np.eye(len(covariance)))
     return Borders(tuple(tracks), tuple(receivers), W, W @ mean)
 
 

@@ -71,6 +71,8 @@ class Surveyed:
         The last estimate, relative to `nominal`.
     slopes : Slopes or None
         What gyroscopic angles say.
+    masks : tuple of ((m,) bool array or None) or None
+        Fixes of each run that belong to this track, where a run follows several.
     """
 
     name: str
@@ -84,6 +86,7 @@ class Surveyed:
     noise: FloatArray = field(default_factory=lambda: np.zeros(0))
     estimate: Estimate | None = None
     slopes: Slopes | None = None
+    masks: tuple[BoolArray | None, ...] | None = None
 
     @property
     def design(self) -> FloatArray:
@@ -96,12 +99,25 @@ class Surveyed:
 
 
 def lay(
-    name: str, runs: tuple[int, ...], fixes: Sequence[Fixes], nominal: Nominal, *, reach: float = REACH
+    name: str,
+    runs: tuple[int, ...],
+    fixes: Sequence[Fixes],
+    nominal: Nominal,
+    *,
+    reach: float = REACH,
+    masks: tuple[BoolArray | None, ...] | None = None,
 ) -> Surveyed:
-    """Lay runs along a nominal curve and cut it where they end."""
+    """Lay runs along a nominal curve and cut it where they end; of each run only the fixes in its mask, where it has one."""
     laid = [traverse(nominal, fixes[i], reach) for i in runs]
+    if masks is not None:
+        laid = [
+            t
+            if mask is None
+            else replace(t, offset=np.where(mask, t.offset, np.nan), right=np.where(mask, t.right, np.nan))
+            for t, mask in zip(laid, masks, strict=True)
+        ]
     profile = profiles(laid, len(nominal), nominal.step)
-    return cut_ends(Surveyed(name, runs, nominal, laid, profile, np.zeros(len(nominal))))
+    return cut_ends(Surveyed(name, runs, nominal, laid, profile, np.zeros(len(nominal)), masks=masks))
 
 
 def cut_ends(track: Surveyed) -> Surveyed:
@@ -226,7 +242,7 @@ def relaid(track: Surveyed, fixes: Sequence[Fixes], *, step: float | None = None
     nominal = track.nominal.shifted(track.axis)
     if step is not None:
         nominal = nominal.resampled(step)
-    new = lay(track.name, track.runs, fixes, nominal)
+    new = lay(track.name, track.runs, fixes, nominal, masks=track.masks)
     new.errors, new.noise_level = track.errors, track.noise_level
     return new
 

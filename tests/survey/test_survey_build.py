@@ -308,26 +308,30 @@ def test_runs_that_overlap_end_to_end_make_one_track():
 
 
 def test_a_stretch_on_another_track_is_seen_and_never_averaged():
+    """Precise runs make a track of it, between two turnouts."""
     runs, axis, frame, rng = single_line(16)
     s = axis.arc
     ramp = np.clip((s - 1500.0) / 60.0, 0.0, 1.0) * np.clip((2600.0 - s) / 60.0, 0.0, 1.0)
     beside = axis.shifted(4.5 * ramp**2 * (3.0 - 2.0 * ramp))
     runs[1] = drive(beside, frame, rng, run_id="run-2", direction="up")
     model = build(runs)
-    assert rms(model, "up", axis) < 0.015
-    (part,) = entry(model, "run-2")["other_track"]
-    assert part["from_m"] == pytest.approx(1500.0, abs=40.0)
-    assert part["to_m"] == pytest.approx(2600.0, abs=40.0)
-    assert part["distance_m"] == pytest.approx(4.5, abs=0.1)
-    assert any("run-2" in w and "another track" in w for w in report(model)["warnings"])
+    assert sorted(model.track_id) == ["up-2", "up/1", "up/2", "up/3"]
+    for part in ("up/1", "up/2", "up/3"):
+        assert rms(model, part, axis) < 0.015
+    assert rms(model, "up-2", beside) < 0.03
+    assert model.length("up/1") == pytest.approx(1500.0, abs=25.0)
+    assert model.length("up-2") == pytest.approx(1100.0, abs=50.0)
+    assert entry(model, "run-2")["tracks"] == ["up", "up-2"]
 
 
-def test_two_runs_in_contradiction_are_not_averaged():
+@pytest.mark.parametrize("apart", [1.6, 2.2])
+def test_runs_too_near_to_be_on_two_tracks_contradict_and_are_not_averaged(apart):
     runs, axis, frame, rng = single_line(17, passes=2)
     s = axis.arc
     ramp = np.clip((s - 1500.0) / 60.0, 0.0, 1.0) * np.clip((2600.0 - s) / 60.0, 0.0, 1.0)
-    runs[1] = drive(axis.shifted(4.5 * ramp**2 * (3.0 - 2.0 * ramp)), frame, rng, run_id="run-2", direction="up")
+    runs[1] = drive(axis.shifted(apart * ramp**2 * (3.0 - 2.0 * ramp)), frame, rng, run_id="run-2", direction="up")
     model = build(runs)
+    assert model.track_id == ("up",)
     assert rms(model, "up", axis) < 0.03  # it follows the first run
     assert entry(model, "run-2")["other_track"]
     assert entry(model, "run-1")["other_track"] == []

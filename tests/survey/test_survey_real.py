@@ -36,10 +36,3 @@ def test_with_telephones_the_loggers_offset_shows(line80):
     assert used / total > 0.97
     for track in report["tracks"]:
         assert track["sigma_cross_m"] < 1.5
-
-
-def test_a_branching_line_is_built_run_by_run(shared_data):
-    runs = [read_run(d) for d in sorted((shared_data / "hev_cinkota").iterdir()) if (d / "run.toml").is_file()]
-    model = build(runs)
-    assert sorted(model.track_id) == sorted(run.direction for run in runs)
-    assert any("rests on one run" in w for w in model.provenance["build"]["warnings"])
