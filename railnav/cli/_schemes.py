@@ -55,7 +55,7 @@ def navigate_scheme(
 ) -> Solution:
     """Navigate a run by a scheme other than "track"; with a model the answers of the schemes without a map lie in its plane."""
     from railnav.navigation.schemes import navigate_inertial
-    from railnav.navigation.schemes.arc import navigate_arc
+    from railnav.navigation.schemes.arc_run import navigate_arc
 
     reference = _files.read_model(model) if model is not None else None
     if scheme == "map-corrector":

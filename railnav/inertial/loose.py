@@ -183,7 +183,8 @@ def integrate_gnss(
     """
     from railnav.estimation._kernels import triangularize_rows
     from railnav.inertial.aided.aiding import Fixes
-    from railnav.inertial.aided.integration import Vehicle, integrate
+    from railnav.inertial.aided.integration import integrate
+    from railnav.inertial.aided.unknowns import Vehicle
 
     arm = np.asarray(lever_arm_b, dtype=np.float64)
     if arm.shape != (3,) or not np.isfinite(arm).all():

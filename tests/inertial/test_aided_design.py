@@ -11,7 +11,8 @@ from railnav.geodesy import WGS84
 from railnav.inertial.aided import _kernels as kernels
 from railnav.inertial.aided import layout as k
 from railnav.inertial.aided.aiding import Fixes, Ranges, Rests, VehicleMotion
-from railnav.inertial.aided.integration import Unknowns, Vehicle, integrate
+from railnav.inertial.aided.integration import integrate
+from railnav.inertial.aided.unknowns import Unknowns, Vehicle
 from railnav.inertial.error_model import error_dynamics, position_scale
 from railnav.inertial.loose import ImuNoise, InitialSigma
 from railnav.inertial.mechanization import GravityField, NavigationState, mechanize

@@ -9,7 +9,8 @@ from scipy.stats import chi2
 from railnav.attitude import dcm_from_rotation_vector, rotation_vector_from_dcm
 from railnav.errors import EstimationError
 from railnav.inertial.aided.aiding import Fixes, Rests, VehicleMotion, find_rests, without_lever_arm
-from railnav.inertial.aided.integration import Unknowns, Vehicle, integrate
+from railnav.inertial.aided.integration import integrate
+from railnav.inertial.aided.unknowns import Unknowns, Vehicle
 from railnav.inertial.error_model import position_scale
 from railnav.inertial.loose import ImuNoise, InitialSigma
 from railnav.inertial.mechanization import GravityField, NavigationState

@@ -10,7 +10,8 @@ import pytest
 from railnav.errors import OffModelError, RunError
 from railnav.evaluation import evaluate
 from railnav.navigation import Epoch, Mode, Navigator, epochs
-from railnav.navigation.schemes.arc import ArcGains, ArcNavigator, navigate_arc
+from railnav.navigation.schemes.arc import ArcGains, ArcNavigator
+from railnav.navigation.schemes.arc_run import navigate_arc
 from railnav.simulation import PHONE, SERVICE, demo_line, simulate
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from railnav.inertial.aided.aiding import Fixes, Ranges, Rests, VehicleMotion, find_rests, without_lever_arm
-from railnav.inertial.aided.integration import AidedSolution, Unknowns, Vehicle, integrate
+from railnav.inertial.aided.integration import AidedSolution, integrate
+from railnav.inertial.aided.unknowns import Unknowns, Vehicle
 
 __all__ = [
     "AidedSolution",
