@@ -40,8 +40,12 @@ def command(ctx: click.Context, file: Path, as_json: bool) -> None:
         from railnav.io.run_check import run_defects
 
         defects, remarks = run_defects(file)
+    elif kind == "log":
+        from railnav.io.run_check import log_defects
+
+        defects, remarks = log_defects(file)
     else:
-        raise InputError(f"a {kind} cannot be validated", file=file, remedy="name a model or a run folder")
+        raise InputError(f"a {kind} cannot be validated", file=file, remedy="name a model, a run folder or a log")
     if as_json:
         print_json(
             {

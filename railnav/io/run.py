@@ -169,6 +169,12 @@ def read_run(folder: str | Path, *, report: Callable[[LogSummary], None] | None 
         if stream.format in FORMATS:
             tables[name] = read_table(path, _COLUMNS[name], error=RunError)
             continue
+        if name != "gnss":
+            from railnav.io.ubx_sensors import sensor_table
+
+            tables[name] = sensor_table(path, name, start)
+            check_table(tables[name], _COLUMNS[name])
+            continue
         log = read_log(path, stream.format, start=start)
         check_table(log.table, _COLUMNS[name])
         tables[name] = log.table
@@ -337,7 +343,8 @@ def _start(start: object, file: Path) -> datetime:
 
 def _stream_file(folder: Path, name: str, stream: _Stream) -> Path:
     contents, column = folder / CONTENTS, f"{name}.file"
-    formats = (*FORMATS, *LOG_FORMATS) if name == "gnss" else FORMATS
+    logs = {"gnss": LOG_FORMATS, "imu": ("ubx",), "odometer": ("ubx",)}  # UBX: ESF-RAW, ESF-MEAS
+    formats = (*FORMATS, *logs.get(name, ()))
     if stream.format not in formats:
         cause = f"{stream.format[:40]!r} is no format that is read here; {', '.join(formats)} are"
         remedy = "convert the stream to CSV with the columns of formats.md"

@@ -57,6 +57,10 @@ def run_defects(folder: str | Path) -> tuple[list[Finding], list[Finding]]:
             path = _stream_file(folder, name, stream)
             if stream.format in FORMATS:
                 defects += [_finding(name, error) for error in _table_defects(path, _COLUMNS[name])]
+            elif name != "gnss":
+                from railnav.io.ubx_sensors import sensor_table
+
+                defects += [_finding(name, error) for error in _judge(sensor_table(path, name, start), _COLUMNS[name])]
             else:
                 log = read_log(path, stream.format, start=start)
                 defects += [_finding(name, error) for error in _judge(log.table, _COLUMNS[name])]
@@ -71,6 +75,20 @@ def run_defects(folder: str | Path) -> tuple[list[Finding], list[Finding]]:
     except RailnavError as error:
         defects.append(("run", str(folder), str(error)))
     return defects, remarks
+
+
+def log_defects(path: str | Path) -> tuple[list[Finding], list[Finding]]:
+    """Judge a log that stands alone: what would have it refused, and what was left out or put right."""
+    from railnav.io.logs import read_bare_log
+
+    summaries: list[LogSummary] = []
+    try:
+        _, notes = read_bare_log(path, report=summaries.append)
+    except InputError as error:
+        return [_finding("log", error)], []
+    remarks = [finding for summary in summaries for finding in _log_remarks("log", summary)]
+    said = {what for _, _, what in remarks}
+    return [], remarks + [("log", str(path), note) for note in notes if note not in said]
 
 
 def _finding(kind: str, error: InputError) -> Finding:

@@ -15,8 +15,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from railnav.errors import RunError
 from railnav.io import _ubx_kernels, gnss_time
 from railnav.io.gnss_log import ByteArray, through
+from railnav.io.tables import Table, _check_file, freeze
 from railnav.run import ImuStream, OdometerStream
 
 FloatArray = NDArray[np.float64]
@@ -129,6 +131,28 @@ def read_sensors(path: str | Path, start: datetime) -> Sensors:
     if np.isin(kind, _TICKS).any():
         notes.append("wheel ticks are counted and left out: the log does not say how far a tick is")
     return Sensors(imu, odometer, counts, tuple(notes))
+
+
+def sensor_table(path: str | Path, stream: str, start: datetime) -> Table:
+    """The "imu" or "odometer" of a UBX log as a table of that stream, in the units of the table of formats.
+
+    Raises
+    ------
+    RunError
+        The log has no such data; the message says what it has.
+    """
+    path = Path(path)
+    _check_file(path, RunError)
+    found = read_sensors(path, start)
+    held = ", ".join(f"{count} {name}" for name, count in found.counts.items()) or "no ESF-RAW or ESF-MEAS"
+    if stream == "imu" and found.imu is not None:
+        number = {f"gyro_{axis}_rad_s": freeze(found.imu.gyro[:, i]) for i, axis in enumerate("xyz")}
+        number |= {f"accel_{axis}_m_s2": freeze(found.imu.specific_force[:, i]) for i, axis in enumerate("xyz")}
+        return Table(path, len(found.imu), {"time_s": freeze(found.imu.time), **number}, error=RunError)
+    if stream == "odometer" and found.odometer is not None and found.odometer.speed is not None:
+        number = {"time_s": freeze(found.odometer.time), "speed_m_s": freeze(found.odometer.speed)}
+        return Table(path, len(found.odometer), number, error=RunError)
+    raise RunError(f"has no data for [{stream}] ({held})", file=path, remedy="leave the stream out")
 
 
 _NAMES = {

@@ -368,6 +368,20 @@ def test_inertial_samples_of_ubx(tmp_path, message):
     assert len(again.imu) == len(truth)
 
 
+def test_a_run_folder_names_the_log_for_every_stream(tmp_path):
+    data, truth = inertial_log(message=0x02)
+    (tmp_path / "a.ubx").write_bytes(data)
+    streams = "".join(f'[{name}]\nfile = "a.ubx"\nformat = "ubx"\n' for name in ("gnss", "imu", "odometer"))
+    toml = f'[run]\nid = "a"\nstart = "{START.isoformat()}"\n{streams}signed = true\n'
+    (tmp_path / "run.toml").write_text(toml)
+    run = read_run(tmp_path)
+    assert len(run.imu) == len(truth)
+    assert run.odometer.speed[0] == -2.5
+    (tmp_path / "a.ubx").write_bytes(b"".join(pvt(i) for i in range(5)))
+    with pytest.raises(RunError, match=r"has no data for \[imu\] \(no ESF-RAW or ESF-MEAS\); leave the stream out"):
+        read_run(tmp_path)
+
+
 def test_broken_frames_are_left_out(tmp_path):
     data, truth = inertial_log(seconds=5)
     data = bytearray(data)

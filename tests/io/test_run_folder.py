@@ -430,7 +430,7 @@ CONTENTS = {
     ),
     "format of another stream": (
         HEAD + '[imu]\nfile = "a.nmea"\nformat = "nmea"\n',
-        "run.toml, column imu.format: 'nmea' is no format that is read here; csv, parquet are; convert the stream to CSV",
+        "run.toml, column imu.format: 'nmea' is no format that is read here; csv, parquet, ubx are; convert the stream to CSV",
     ),
     "no TOML": ("[run\nid = 3", "run.toml: is no TOML ("),
     "nested": ("a = " + "[" * 5000, "run.toml: is no TOML ("),
