@@ -61,6 +61,9 @@ class Channel:
     band : Band or None
     spacing : float
         Distance between raw samples, m.
+    local : (n,) array or None
+        Standard deviation place by place, where it differs: in bands, an error of place costs most where the model's shape, taken off, is
+        sharpest.
     """
 
     key: str
@@ -71,6 +74,7 @@ class Channel:
     source: str
     band: Band | None = None
     spacing: float = math.nan
+    local: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -277,17 +281,21 @@ def _bands(recording: Recording, channels: dict[str, Channel], refused: dict[str
                 refused[key] = f"no stretch without a gap is longer than {2 * band.settling:g} m"
                 continue
             white = band_noise(of.noise, of.spacing, band, integrate=times)
+            misplaced = _misplaced(recording, name, band)
+            steady = math.hypot(white, _slope(values, recording.step) * recording.passage.sigma)
+            mean_square = (
+                float(np.mean(misplaced[np.isfinite(misplaced)] ** 2)) if np.isfinite(misplaced).any() else 0.0
+            )
             channels[key] = Channel(
                 key,
                 f"{title} {band.name}",
                 "m",
                 values,
-                math.hypot(
-                    white, _misplaced(recording, name, band), _slope(values, recording.step) * recording.passage.sigma
-                ),
+                math.sqrt(steady**2 + mean_square),
                 of.source,
                 band,
                 of.spacing,
+                np.hypot(steady, misplaced),
             )
 
 
@@ -309,15 +317,21 @@ def _gnss_instead(recording: Recording, name: str, band: Band) -> str:
     return f"; its GNSS positions would leave {1e3 * noise:,.0f} mm of noise in {band.name}"
 
 
-def _misplaced(recording: Recording, name: str, band: Band) -> float:
-    """What an error of place along the track leaves in a band when the model's shape is taken off: its bearing there, times the error."""
+def _misplaced(recording: Recording, name: str, band: Band) -> FloatArray:
+    """What an error of place along the track leaves in a band when the model's shape is taken off: its bearing there, times the error.
+
+    Greatest within half a longest wave, since a curve that begins elsewhere shows all around its beginning.
+    """
+    from scipy.ndimage import maximum_filter1d
+
     if not recording.against_model:
-        return 0.0
+        return np.zeros(len(recording.distance))
     point = recording.points
     bend = point.curvature if name == "alignment" else np.gradient(np.arctan(point.gradient), recording.step)
     shape = band_pass(np.where(np.isfinite(bend), bend, 0.0), recording.step, band, integrate=1)
-    known = shape[np.isfinite(shape)]
-    return float(np.sqrt(np.mean(known**2))) * recording.passage.sigma if len(known) else 0.0
+    reach = 2 * round(0.25 * band.upper / recording.step) + 1
+    largest = maximum_filter1d(np.where(np.isfinite(shape), np.abs(shape), 0.0), reach)
+    return np.asarray(largest * recording.passage.sigma)
 
 
 def _gnss(recording: Recording, channels: dict[str, Channel], refused: dict[str, str]) -> None:

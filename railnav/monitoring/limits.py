@@ -24,6 +24,8 @@ LEVELS = ("alert", "intervention", "immediate")
 CLASSES = "ABCDE"
 #: A channel is judged where its sigma is at most this share of the mildest limit.
 FINE_ENOUGH = 1.0 / 3.0
+#: A channel that is fine enough on less than this share of what the run covers is not judged at all.
+LEAST_SHARE = 0.2
 #: Stretches beyond a limit, of one sign and nearer than this, are one defect, m.
 ONE_DEFECT = 2.0
 #: A passage whose track is certain in less than this share of its rows is not judged: which track it shows is not known.
@@ -152,13 +154,14 @@ class Exceedance:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Whether a channel was judged, and if not, why: `reason` is empty where it was."""
+    """Whether a channel was judged, and if not, why: `reason` is empty where it was; `share` of what the run covers was."""
 
     channel: str
     title: str
     sigma: float
     mildest: float
     reason: str
+    share: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -232,12 +235,16 @@ def exceedances(geometry: Geometry, table: LimitTable, speed: float) -> tuple[li
             verdicts.append(Verdict(key, title, sigma, math.nan, "which track the run was on is not certain"))
             continue
         mildest = min(min(abs(v) for v in limit.levels[limit.mildest]) for limit in limits)
-        if not sigma <= FINE_ENOUGH * mildest:
+        fine = np.full(len(geometry.distance), sigma) if channel.local is None else channel.local
+        known = np.isfinite(channel.values)
+        judged = known & (fine <= FINE_ENOUGH * mildest)
+        share = float(judged.sum() / known.sum()) if known.any() else 0.0
+        if share < LEAST_SHARE:
             verdicts.append(Verdict(key, title, sigma, mildest, "its noise is over a third of the mildest limit"))
             continue
-        verdicts.append(Verdict(key, title, sigma, mildest, ""))
+        verdicts.append(Verdict(key, title, sigma, mildest, "", share))
         for limit in limits:
-            there = (radius >= limit.radius[0]) & (radius < limit.radius[1])
+            there = judged & (radius >= limit.radius[0]) & (radius < limit.radius[1])
             found += _beyond(geometry, channel, limit, there)
     order = {level: i for i, level in enumerate(reversed(LEVELS))}
     return sorted(found, key=lambda e: (order[e.level], e.peak)), verdicts

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -73,13 +74,23 @@ def overlay(geometry: Geometry, reference: Geometry, *, reach: float = 3.0) -> O
     ----------
     docs/theory/geometry.md (9).
     """
-    step = geometry.recording.step
     pairs = [
         (geometry.channels[key].values, reference.channels[key].values)
         for key in KEYS
         if key in geometry.channels and key in reference.channels and geometry.channels[key].spacing <= 1.0
     ]
-    count = len(geometry.distance)
+    return _laid_over(pairs, geometry.distance, geometry.recording.step, reach, LEAST_CORRELATION)
+
+
+def _laid_over(
+    pairs: Sequence[tuple[FloatArray, FloatArray]],
+    distance: FloatArray,
+    step: float,
+    reach: float,
+    enough: float,
+) -> Overlay:
+    """The shifts between rows, window by window."""
+    count = len(distance)
     half, pitch, most = round(0.5 * WINDOW / step), round(PITCH / step), round(reach / step)
     middles = np.arange(half + most, count - half - most, pitch)
     if not pairs or not len(middles):
@@ -87,8 +98,9 @@ def overlay(geometry: Geometry, reference: Geometry, *, reach: float = 3.0) -> O
     lags = np.arange(-most, most + 1)
     total, used = np.zeros((len(middles), len(lags))), np.zeros((len(middles), len(lags)))
     for a, b in pairs:
-        a = a - np.nanmedian(a)
-        b = b - np.nanmedian(b)
+        if not (np.isfinite(a).any() and np.isfinite(b).any()):
+            continue
+        a, b = a - np.nanmedian(a), b - np.nanmedian(b)
         for j, lag in enumerate(lags):
             r = _window_correlation(np.roll(a, -lag), b, middles, half)
             known = np.isfinite(r)
@@ -102,13 +114,13 @@ def overlay(geometry: Geometry, reference: Geometry, *, reach: float = 3.0) -> O
     left, peak, right = score[row, k - 1], score[row, k], score[row, k + 1]
     bend = left - 2.0 * peak + right
     fine = np.where(bend < 0.0, 0.5 * (left - right) / np.where(bend < 0.0, bend, -1.0), 0.0)
-    believed = inner & (peak >= LEAST_CORRELATION)
+    believed = inner & (peak >= enough)
     shift = ((lags[k] + np.clip(fine, -1.0, 1.0)) * step)[believed]
     scatter = math.nan
     if len(shift) >= 3:
         scatter = float(1.4826 * np.median(np.abs(shift - _smoothed(shift))))
-    common = int((used > 0).any(axis=1).sum())
-    return Overlay(geometry.distance[middles][believed], shift, peak[believed], common, scatter)
+    common = int(((used > 0).any(axis=1)).sum())
+    return Overlay(distance[middles][believed], shift, peak[believed], common, scatter)
 
 
 def _window_correlation(a: FloatArray, b: FloatArray, middles: NDArray[np.int64], half: int) -> FloatArray:

@@ -6,7 +6,7 @@ Left and right, up and down are the track's as distance grows, whichever way the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -284,7 +284,9 @@ def _imu(
     notes: list[str],
 ) -> None:
     section = passage.section
-    d = passage.where(stream.time)
+    # a row is the mean over the interval that ends at its time: it belongs to the middle
+    time = stream.time - 0.5 * float(np.median(np.diff(stream.time))) if len(stream.time) > 1 else stream.time
+    d = passage.where(time)
     inside = np.isfinite(d)
     # standstill beyond the passage counts too: the passage's rows leave it out
     gyro = stream.gyro @ dcm_from_euler(*stream.mounting).T
@@ -293,7 +295,7 @@ def _imu(
     if len(rows) < 8:
         return
     d = d[rows]
-    speed = passage.speed_at(stream.time[rows])
+    speed = passage.speed_at(time[rows])
     model = section.at(d)
     rate_b = gyro[rows] - bias
     if not words:  # no standstill: the Earth's rate about the vertical goes off by formula, its share elsewhere is below 5e-5 rad/s
@@ -312,12 +314,17 @@ def _imu(
         curvature = curvature - left / speed
         words = f"gyro z bias {math.degrees(bias[2] + left) * 3600:.0f} deg/h from the model's curvature (no standstill in the run)"
     notes.append(f"IMU: {words}" if words else "IMU: gyro bias unknown (no standstill)")
-    vertical = np.gradient(np.arctan(model.gradient), d, edge_order=1) if len(d) > 2 else np.zeros(len(d))
-    vertical = np.where(np.isfinite(vertical), vertical, 0.0)
     noise_z, noise_y = noise_floor(curvature), noise_floor(bend)
-    series["curvature_full"] = _placed(d, curvature, grid, "IMU", noise=noise_z)
-    series["curvature"] = _placed(d, curvature - expected if against_model else curvature, grid, "IMU", noise=noise_z)
-    series["pitch_rate"] = _placed(d, bend - vertical if against_model else bend, grid, "IMU", noise=noise_y)
+    series["curvature_full"] = whole = _placed(d, curvature, grid, "IMU", noise=noise_z)
+    bending = _placed(d, bend, grid, "IMU", noise=noise_y)
+    if against_model:
+        # differences of the model's angles on the grid, so that a kink between two tracks is in them as it is in the rates
+        point, step = section.at(grid), float(grid[1] - grid[0])
+        whole = replace(whole, values=whole.values - np.gradient(np.unwrap(point.heading), step))
+        slope = np.arctan(point.gradient)
+        rise = np.gradient(np.where(np.isfinite(slope), slope, 0.0), step)
+        bending = replace(bending, values=bending.values - rise)
+    series["curvature"], series["pitch_rate"] = whole, bending
 
 
 def _gyro_bias(stream: ImuStream, passage: Passage, gyro: FloatArray) -> tuple[FloatArray, str]:

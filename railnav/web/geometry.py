@@ -446,7 +446,7 @@ def _ability_section(report: Report) -> Section:
             run = geometry.recording.run.id
             for v in verdicts:
                 channel = geometry.channels.get(v.channel)
-                judged = ("yes" if not v.reason else "channel only") if channel else "no"
+                judged = (words.share(round(v.share, 2)) if not v.reason else "channel only") if channel else "no"
                 merged.setdefault((v.title, channel.source if channel else "", v.reason, judged), []).append(
                     (run, channel)
                 )

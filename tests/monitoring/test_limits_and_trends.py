@@ -308,3 +308,34 @@ def test_speed_classes():
         300,
         300,
     ]
+
+
+@pytest.mark.parametrize("sensors", ["imu", "angles"])
+def test_perfect_track_with_turnouts_has_no_exceedance(sensors):
+    """No irregularities, but turnouts of 300 m radius, taken by a train whose place is known to centimetres or decimetres."""
+    from railnav.simulation import SERVICE, Leg, simulate
+    from railnav.simulation.irregularities import GEOMETRY
+
+    outfit = SERVICE if sensors == "imu" else GEOMETRY
+    way = next(
+        route for route in line().routes("77R-01", "77R-03") if len(route.tracks) > 3
+    )  # by the station's other track
+    leg = Leg(way.tracks, start=50.0, finish=1500.0)
+    run, _ = simulate(line(), leg, seed=6, outfit=outfit, tunnels=False)
+    made = monitor([run], line(), default_limits(), against_model=True)
+    part = made.sections[0]
+    assert [v.channel for v in part.verdicts[0] if v.channel == "alignment_d1" and not v.reason]
+    assert [(e.channel, round(1e3 * e.value, 1), e.track, round(e.offset)) for e in part.exceedances] == []
+
+
+def test_where_place_costs_too_much_a_channel_is_not_judged_there():
+    made = geometry(1)
+    channel = made.channels["alignment_d1"]
+    at = np.abs(made.distance - 1700.0) < 20.0  # the defect of 15 mm
+    local = np.where(at, 0.02, channel.local)
+    found, verdicts = exceedances(
+        replace(made, channels={"alignment_d1": replace(channel, local=local)}), default_limits(), SPEED
+    )
+    assert not [e for e in found if abs(e.offset - 1700.0) < 20.0]
+    share = next(v for v in verdicts if v.channel == "alignment_d1").share
+    assert 0.9 < share < 1.0
