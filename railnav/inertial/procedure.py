@@ -337,12 +337,14 @@ def _faces(
 ) -> tuple[FloatArray, FloatArray, list[int]]:
     """Readings of each axis with that axis up and down (or turned both ways), and how many there were of each."""
     sums, counts = np.zeros((3, 2)), np.zeros((3, 2), dtype=int)
-    bias = np.median(means, axis=0)  # that of raw gyros may be half the rate, of raw accelerometers a sixth of gravity
+    whole = len(found) >= 6
+    # the bias of raw gyros may be half the rate, of raw accelerometers a sixth of gravity
+    bias = np.median(means, axis=0) if whole else np.zeros(3)
     for one, mean in zip(found, means, strict=True):
         sensed = mean - bias
         axis = int(np.argmax(np.abs(sensed)))
         tilt = math.acos(min(1.0, abs(sensed[axis]) / float(np.linalg.norm(sensed))))
-        if tilt > LARGEST_TILT:
+        if whole and tilt > LARGEST_TILT:
             raise EstimationError(
                 f"position {one.name} lies {math.degrees(tilt):.0f} degrees off the nearest axis: level it (to a degree), or use "
                 f"{'multi-position' if what == 'up' else 'modified-multi-position'}, which takes any attitude"
@@ -353,9 +355,8 @@ def _faces(
     missing = [f"{'+-'[side]}{'xyz'[axis]}" for axis in range(3) for side in range(2) if not counts[axis, side]]
     if missing:
         verb = "up" if what == "up" else "turning (rate of this sign)"
-        raise EstimationError(
-            f"{len(found)} positions leave faces out; add positions with these axes {verb}: {'; '.join(missing)}"
-        )
+        leave = "1 position leaves" if len(found) == 1 else f"{len(found)} positions leave"
+        raise EstimationError(f"{leave} faces out; add positions with these axes {verb}: {'; '.join(missing)}")
     mean = sums / counts
     return mean[:, 0], mean[:, 1], counts.ravel().tolist()
 

@@ -227,6 +227,7 @@ FIRST = SIX.logs[0].imu
         (SIX.logs, ["six-position"], {"gravity": 1.0}, "found nowhere on land"),
         (SIX.logs, ["six-position"], {"gravity": None}, "local gravity is unknown"),
         (SIX.logs[:5], ["six-position"], {}, "add positions with these axes up: -z"),
+        (SIX.logs[:1], ["six-position"], {}, "1 position leaves faces out; add positions with these axes up: -x; \\+y; -y; \\+z; -z"),
         (NINE.logs, ["six-position"], {}, "45 degrees off the nearest axis.*multi-position"),
         (SIX.logs, ["multi-position"], {}, "6 positions cannot determine 9 parameters; add positions with these axes up:"),
         (NINE.logs[:8], ["multi-position"], {}, "8 positions cannot determine 9 parameters; add positions"),
