@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +14,7 @@ from railnav.errors import RunError
 from railnav.matching.network import balises_of
 from railnav.navigation import columns as c
 from railnav.navigation.engine import Engine
-from railnav.navigation.epochs import COLUMNS, IDLE_STEP, Epoch
+from railnav.navigation.epochs import COLUMNS, IDLE_STEP, IMU_STEP, SAME_TIME, Epoch
 from railnav.navigation.explanation import Candidate, candidates_now
 from railnav.navigation.solution import Mode
 from railnav.navigation.state import Settings
@@ -124,6 +125,8 @@ class Navigator:
         Kind of GNSS receiver; one that the model's survey knows is moved to the model's datum.
     balises : bool
         Whether the train has a balise reader: then a balise of the model that is passed and not read is evidence.
+    patience : float
+        How long an epoch may be under way, s: sensors may then come in any order, and what is said is that much older. 0: in order.
     integrity_risk : float
         Risk, per epoch, that the along-track error exceeds the protection level.
     settings : Settings, optional
@@ -151,6 +154,7 @@ class Navigator:
         lever_arm_b: ArrayLike = (0.0, 0.0, 0.0),
         receiver: str = "",
         balises: bool = False,
+        patience: float = 0.0,
         integrity_risk: float = 1e-4,
         settings: Settings | None = None,
     ) -> None:
@@ -166,6 +170,11 @@ class Navigator:
             receiver=receiver,
             balises=balises,
         )
+        if not patience >= 0.0:
+            raise ValueError(f"patience {patience} s is not a time")
+        self._patience, self._waiting = patience, list[Epoch]()
+        self._inertial, self._force, self._force_time = imu, math.nan, -math.inf
+        self._latest = _nowhere(model)
         self._balises = balises_of(model)
         self._raw = np.empty((1, len(COLUMNS)))
         self._row = np.empty((1, c.OUTPUT_SIZE))
@@ -190,7 +199,9 @@ class Navigator:
         Parameters
         ----------
         epoch : Epoch
-            Later than the one before. A gap is bridged in steps of at most 1 s.
+            All that one instant brings, or what one sensor brings of it. With `patience`, epochs may come in any order within that
+            time, those of one instant are put together, and what is said is of the newest instant that no epoch can precede any more.
+            A gap is bridged in steps of at most 1 s.
 
         Returns
         -------
@@ -199,13 +210,43 @@ class Navigator:
         Raises
         ------
         RunError
-            The epoch is not later than the one before.
+            The epoch is late: it belongs before what has been taken in already.
         """
         before = float(self._engine.shared.common[c.C_TIME])
         if not epoch.time > before:
+            late = before - epoch.time
             raise RunError(
-                f"epoch at {epoch.time} s is not later than the one before, at {before} s", remedy="sort the epochs"
+                f"epoch at {epoch.time} s is not later than the one before, at {before} s: {late:.3g} s late",
+                remedy="sort the epochs, or give the navigator patience",
             )
+        if self._patience <= 0.0:
+            return self._take(epoch)
+        self._waiting.append(epoch)
+        newest = max(waiting.time for waiting in self._waiting)
+        return self._take_until(newest - self._patience)
+
+    def flush(self) -> Position:
+        """Take in the epochs that are still waiting, and say where the train is."""
+        return self._take_until(math.inf)
+
+    def _take_until(self, time: float) -> Position:
+        """Take in the waiting epochs up to a time, in order, those of one instant as one."""
+        ready = sorted((e for e in self._waiting if e.time <= time), key=lambda e: e.time)
+        self._waiting = [e for e in self._waiting if e.time > time]
+        while ready:
+            instant = [e for e in ready if e.time - ready[0].time <= SAME_TIME]
+            ready = ready[len(instant) :]
+            self._latest = self._take(_together(instant))
+        return self._latest
+
+    def _take(self, epoch: Epoch) -> Position:
+        """Take in one epoch, all of it."""
+        before = float(self._engine.shared.common[c.C_TIME])
+        if self._inertial and not math.isfinite(epoch.forward_force):
+            if epoch.time - self._force_time < 1.5 * IMU_STEP:  # a fix between two inertial samples
+                epoch = replace(epoch, forward_force=self._force)
+        elif self._inertial:
+            self._force, self._force_time = epoch.forward_force, epoch.time
         for i, name in enumerate(_NUMBERS):
             self._raw[0, i] = getattr(epoch, name)
         self._raw[0, len(_NUMBERS) :] = self._balises.get(epoch.balise, _NO_BALISE) if epoch.balise else _NO_BALISE
@@ -250,3 +291,24 @@ class Navigator:
             best[on] = (total + weight, max(most, weight), offset if weight > most else where)
         ordered = sorted(best.items(), key=lambda item: -item[1][0])
         return tuple(Alternative(self.model.track_id[t], where, total) for t, (total, _, where) in ordered)
+
+
+def _together(instant: Sequence[Epoch]) -> Epoch:
+    """What several sensors bring at one instant as one epoch; where two bring the same, the later one holds."""
+    if len(instant) == 1:
+        return instant[0]
+    brought: dict[str, float | str] = {}
+    for epoch in instant:
+        for name in _NUMBERS[1:]:
+            value = getattr(epoch, name)
+            if math.isfinite(value):
+                brought[name] = value
+        if epoch.balise:
+            brought["balise"] = epoch.balise
+    return replace(Epoch(instant[-1].time), **brought)  # type: ignore[arg-type]
+
+
+def _nowhere(model: TrackModel) -> Position:
+    """What is said before anything has been taken in."""
+    nan = math.nan
+    return Position(-math.inf, None, nan, nan, nan, nan, nan, nan, Mode.INITIALISING, 0, (), model)
