@@ -81,8 +81,8 @@ PAGES = {
             Section(
                 "alignment",
                 "Elements of alignments",
-                "Simulated noise on sampled designs. A curve of R = 600 m and L = 80 m over seeds; a made-up line of 31 km; two main tracks "
-                "of SBB and the trams of Mannheim, each metre with 5 mm, against their own element tables. A joint counts as one "
+                "Simulated noise on sampled designs. A curve of R = 600 m and L = 80 m over seeds; a made-up line of 31 km; two main "
+                "tracks of SBB and the trams of Mannheim, each metre with 5 mm, against their own element tables. A joint counts as one "
                 "that such points can show if its change moves the shorter neighbour by over four sigmas of its mean.",
                 "python benchmarks/alignment.py",
                 real_data=True,
@@ -127,6 +127,13 @@ PAGES = {
                 "Every claim of the two sources behind the inertial suite, measured again on simulated data: what the source says, "
                 "what comes out, and why where it cannot hold.",
                 "python benchmarks/claims.py",
+            ),
+            Section(
+                "geometry",
+                "Track geometry: channels, defects, overlay, trends, lining (simulated)",
+                "Recording cars on irregular track of the bundled line, everything simulated: filters against sinusoids, chords, channels "
+                "against the fields they drove over, defects found and false, runs over each other, growth, the measured axis, and how fast.",
+                "python benchmarks/geometry.py",
             ),
             Section(
                 "outages",

@@ -29,6 +29,8 @@ BEYOND = 0.05
 SHORTEST = 100.0
 #: A plan on an axis known worse than this is not for a machine, m.
 USABLE = 0.02
+#: A shape known worse than this is said, m.
+COARSE_SHAPE = 0.002
 #: Chord of the versines, m.
 CHORD = 20.0
 
@@ -174,6 +176,11 @@ def line_up(
         raise TrackError(f"nodes each {step} m do not fit an axis measured each {measured.step} m")
     k = round(every)
     notes = list(measured.notes)
+    if measured.relative_right > COARSE_SHAPE:
+        notes.append(
+            f"the shape of the track is known to {1e3 * measured.relative_right:.1f} mm only (no angles, or too far apart): corrections smaller "
+            "than that follow noise"
+        )
     part = _longest(measured, notes)
     section, d = measured.section, measured.distance[part]
     model = section.at(d)

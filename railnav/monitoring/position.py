@@ -144,7 +144,7 @@ def measured_axis(section: Section, recordings: Sequence[Recording], *, step: fl
         sigma_up,
         relative_right,
         relative_up,
-        tuple(recording.run.id for recording, _, _, _ in parts),
+        tuple(dict.fromkeys(recording.run.id for recording, _, _, _ in parts)),
         tuple(notes),
     )
 
