@@ -13,7 +13,7 @@ from railnav.survey.grouping import tracks_of_line
 from railnav.survey.nominal import Nominal, lines, smooth_course
 from railnav.survey.report import Survey
 from railnav.survey.surveyed import Surveyed
-from railnav.survey.topology import Branch, Way, parted_lines, ways_of_line
+from railnav.survey.topology import Branch, Way, parted_lines, precise, ways_of_line
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -67,8 +67,10 @@ def lay_out(survey: Survey) -> tuple[list[Surveyed], list[Join]]:
                     if springs
                 ]
             continue
-        fine = surveyed.lay("", members, fixes, nominal.resampled(FINE_STEP), reach=LINE_REACH)
-        ways = ways_of_line(fine.profile.right, fine.design, fine.nominal.step)
+        ways = None
+        if precise(whole.profile.right, whole.design):
+            fine = surveyed.lay("", members, fixes, nominal.resampled(FINE_STEP), reach=LINE_REACH)
+            ways = ways_of_line(fine.profile.right, fine.design, fine.nominal.step)
         if ways is not None:
             found = _ways(survey, fine, ways, tracks)
             tracks += found

@@ -118,6 +118,11 @@ def ways_of_line(value: FloatArray, design: FloatArray, step: float) -> list[Way
     return ways
 
 
+def precise(value: FloatArray, design: FloatArray) -> bool:
+    """Whether profiles (K, N) of runs are precise enough to show turnouts between tracks side by side."""
+    return len(value) > 1 and _levelled(value, design) is not None
+
+
 def _gather_members(level: FloatArray, free: BoolArray, way: Way, tolerance: float, common: int) -> None:
     """Take in the stretches of other runs on a way; where its leader's data end and a member goes on, the way goes on with it."""
     K, N = level.shape

@@ -14,13 +14,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from railnav.errors import TrackError
-from railnav.estimation.merging import ChainRecords
+
+if TYPE_CHECKING:
+    from railnav.estimation.merging import ChainRecords
 
 FloatArray = NDArray[np.float64]
 
@@ -59,6 +61,8 @@ class AxisRecords:
 
     def chain(self) -> ChainRecords:
         """Give the rows as records of the estimation room, the common frame offset held fixed."""
+        from railnav.estimation.merging import ChainRecords  # kernels are loaded when they are needed
+
         N = len(self.rows)
         records = np.zeros((N - 1, 3, 7))
         records[:, _UPPER[0], _UPPER[1]] = self.rows[:-1, :6]
