@@ -12,7 +12,7 @@ from railnav.errors import EstimationError, TrackError
 from railnav.monitoring.design import Design
 from railnav.monitoring.fitting import judgement, precision, segmentation, stretches
 from railnav.monitoring.fitting.axis import Axis
-from railnav.monitoring.fitting.noise import Resolution, likeliest, resolution
+from railnav.monitoring.fitting.noise import Resolution, fourth_difference_sigma, likeliest, resolution
 from railnav.monitoring.fitting.plan import Chain, PlanFit, chain_of_pieces, fit_plan
 from railnav.monitoring.fitting.rounding import round_design
 from railnav.monitoring.fitting.segmentation import Noise, Pieces
@@ -25,7 +25,9 @@ IntArray = NDArray[np.int64]
 
 #: Points count as exact below this, m: coordinates of designs are rounded, and joints close to a millimetre.
 FLOOR = 5e-4
-FLOOR_CANT = 2e-4
+FLOOR_CANT = 3e-4
+#: Cant of smoothed values is told to this, m.
+SMOOTH_CANT = 1e-3
 #: A law must be likelier than the clothoid by this, in -2 log likelihood, to be said; and one transition's than the track's.
 LAW_WORTH = 8.0
 LAW_ALONE = 25.0
@@ -488,6 +490,15 @@ def _plan_sigmas(fit: PlanFit, noise: Noise) -> tuple[FloatArray, FloatArray, Fl
 # --- profile and cant -------------------------------------------------------------------------------------------------
 
 
+def _feet_of_all(axis: Axis, rows: IntArray, fit: PlanFit) -> FloatArray:
+    """Lengths of all points along the fitted axis, also of those that were passed over; strictly growing, m."""
+    along = np.interp(axis.along, axis.along[rows], fit.along)
+    beyond = axis.along > axis.along[rows[-1]]
+    along[beyond] = fit.along[-1] + axis.along[beyond] - axis.along[rows[-1]]
+    least = 1e-6 * np.arange(len(along))
+    return np.asarray(np.maximum.accumulate(along - least) + least)
+
+
 def _values_resolution(values: FloatArray, along: FloatArray, floor: float, stated: float | None = None) -> Resolution:
     spacing = float(along[-1] - along[0]) / (len(along) - 1)
 
@@ -504,13 +515,13 @@ def _profile(
     if axis.height is None:
         warnings.append(f"track {axis.track} has no heights: no profile")
         return None, None, None, None
-    along, height = fit.along, axis.height[rows]
+    along, height = _feet_of_all(axis, rows, fit), axis.height
     stated = None if axis.stated is None else float(np.median(axis.stated[:, 1]))
     chosen = _values_resolution(height, along, FLOOR, stated)
     pick = np.arange(0, len(along), chosen.every)
     along, height = along[pick], height[pick]
     white = chosen.sigma if sigma is None else sigma
-    place = axis.along[rows][pick]
+    place = axis.along[pick]
     slope = np.gradient(height, place)
     wide = max(3, round(50.0 / chosen.spacing))
     smooth = np.convolve(slope, np.ones(wide) / wide, mode="same")
@@ -542,15 +553,16 @@ def _cant(
 ) -> tuple[Cant | None, FloatArray | None, Noise | None, FloatArray | None]:
     if axis.cant is None:
         return None, None, None, None
-    along, cant = fit.along, axis.cant[rows]
-    chosen = _values_resolution(cant, along, FLOOR_CANT)
-    pick = np.arange(0, len(along), chosen.every)
-    along, cant = along[pick], cant[pick]
+    along, cant = _feet_of_all(axis, rows, fit), axis.cant
+    white = fourth_difference_sigma(cant)
+    smooth = white < FLOOR_CANT  # no gauge is as good: these values come from smoothing
+    white = SMOOTH_CANT if smooth else white
 
     def pieces(noise: Noise, part: slice, beam: int = segmentation.NARROW) -> Pieces:
         return segmentation.segment_cant(along[part], cant[part], noise, rate_scale=1e-3, beam=beam)
 
-    noise = likeliest(pieces, len(along), chosen.spacing, chosen.sigma, floor=FLOOR_CANT)
+    spacing = float(along[-1] - along[0]) / (len(along) - 1)
+    noise = Noise(white) if smooth else likeliest(pieces, len(along), spacing, white, floor=FLOOR_CANT)
     found = stretches.stretches_of_pieces(pieces(noise, slice(0, len(along)), segmentation.BEAM), along, cant, 1)
     per_point = np.full(len(along), float(np.hypot(np.mean(noise.sigma), noise.correlated)))
     fitted = stretches.fit_stretches(found, along, cant, per_point)
