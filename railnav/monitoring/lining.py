@@ -178,8 +178,8 @@ def line_up(
     notes = list(measured.notes)
     if measured.relative_right > COARSE_SHAPE:
         notes.append(
-            f"the shape of the track is known to {1e3 * measured.relative_right:.1f} mm only (no angles, or too far apart): corrections smaller "
-            "than that follow noise"
+            f"the shape of the track is known to {1e3 * measured.relative_right:.1f} mm only (no angles, or too far apart): smaller "
+            "corrections follow noise"
         )
     part = _longest(measured, notes)
     section, d = measured.section, measured.distance[part]

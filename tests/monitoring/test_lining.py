@@ -220,6 +220,9 @@ def test_slews_bring_the_track_onto_its_design():
     assert np.abs(plan.right_after[middle]).max() < 1e-3
     assert plan.slew[[0, -1]] == pytest.approx([0.0, 0.0], abs=1e-9)  # ramps at both ends
     assert np.abs(np.diff(plan.right_after, 3)).max() <= 5e-6 * 5.0**3 + 1e-9
+    clear = (plan.distance > 100.0) & (plan.distance < length - 100.0)
+    assert np.abs(plan.versine_before[clear]).max() > 0.003  # the wave, seen by the chord
+    assert np.abs(plan.versine_after[clear]).max() < 0.001  # straight
     # the classic method agrees with the coordinates up to the line through the ends
     inside = (plan.hallade_distance > 80.0) & (plan.hallade_distance < length - 80.0)
     difference = plan.hallade_slew - np.interp(plan.hallade_distance, plan.distance, plan.slew)
