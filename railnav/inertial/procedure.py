@@ -16,10 +16,10 @@ from railnav.errors import EstimationError
 from railnav.inertial.advice import axes_up
 from railnav.inertial.allan import allan_deviation, fit_allan
 from railnav.inertial.calibration import Form, TriadCalibration, multi_position, six_position, vector_calibration
+from railnav.inertial.faces import faces, repeated_sigma
 from railnav.inertial.imu_calibration import ImuCalibration, Provenance, TriadNoise, TriadTemperature
 from railnav.inertial.mechanization import EARTH_RATE
 from railnav.inertial.positions import (
-    LARGEST_TILT,
     Position,
     PositionLog,
     PositionResult,
@@ -227,8 +227,8 @@ def _static(
     means = np.array([one.force.mean for one in found])
     sigma = _pooled([one.force for one in found])
     if method == "six-position":
-        up, down, counts = _faces(found, means, "up")
-        return six_position(up, down, gravity, sigma=sigma / math.sqrt(min(counts)))
+        up, down, counts, scatter = faces(found, means, "up")
+        return six_position(up, down, gravity, sigma=repeated_sigma(sigma, counts, scatter, remarks, "accelerometers"))
     triad = multi_position(means, gravity, form=form, sigma=sigma)
     triad = _widened(triad, sigma, partial(_norm, means, gravity, form), remarks, "accelerometers")
     _advise_norm(triad, means, remarks)
@@ -254,9 +254,9 @@ def _modified(
             turned = means[k] - bias
             axis = int(np.argmax(np.abs(turned)))
             scaled[k, axis] -= math.copysign(float(reference[k]) - nominal, turned[axis])
-        up, down, counts = _faces(found, scaled, "turning")
+        up, down, counts, scatter = faces(found, scaled, "turning")
         return replace(
-            six_position(up, down, nominal, sigma=sigma / math.sqrt(min(counts))), method="modified six-position"
+            six_position(up, down, nominal, sigma=repeated_sigma(sigma, counts, scatter, remarks, "gyros")),
         )
     triad = multi_position(means, reference, form=form, sigma=sigma)
     triad = _widened(triad, sigma, partial(_norm, means, reference, form), remarks, "gyros")
@@ -330,35 +330,6 @@ def _bias_at_rest(
     np.fill_diagonal(covariance[:3, :3], np.maximum(scatter, noise + unseen) / count)
     residual = float(np.sqrt(np.mean((rates - bias) ** 2)))
     return TriadCalibration("mean at rest", bias, np.eye(3), covariance, residual, count, 3, 1.0)
-
-
-def _faces(
-    found: Sequence[PositionResult], means: FloatArray, what: Literal["up", "turning"]
-) -> tuple[FloatArray, FloatArray, list[int]]:
-    """Readings of each axis with that axis up and down (or turned both ways), and how many there were of each."""
-    sums, counts = np.zeros((3, 2)), np.zeros((3, 2), dtype=int)
-    whole = len(found) >= 6
-    # the bias of raw gyros may be half the rate, of raw accelerometers a sixth of gravity
-    bias = np.median(means, axis=0) if whole else np.zeros(3)
-    for one, mean in zip(found, means, strict=True):
-        sensed = mean - bias
-        axis = int(np.argmax(np.abs(sensed)))
-        tilt = math.acos(min(1.0, abs(sensed[axis]) / float(np.linalg.norm(sensed))))
-        if whole and tilt > LARGEST_TILT:
-            raise EstimationError(
-                f"position {one.name} lies {math.degrees(tilt):.0f} degrees off the nearest axis: level it (to a degree), or use "
-                f"{'multi-position' if what == 'up' else 'modified-multi-position'}, which takes any attitude"
-            )
-        side = int(sensed[axis] < 0.0)
-        sums[axis, side] += mean[axis]
-        counts[axis, side] += 1
-    missing = [f"{'+-'[side]}{'xyz'[axis]}" for axis in range(3) for side in range(2) if not counts[axis, side]]
-    if missing:
-        verb = "up" if what == "up" else "turning (rate of this sign)"
-        leave = "1 position leaves" if len(found) == 1 else f"{len(found)} positions leave"
-        raise EstimationError(f"{leave} faces out; add positions with these axes {verb}: {'; '.join(missing)}")
-    mean = sums / counts
-    return mean[:, 0], mean[:, 1], counts.ravel().tolist()
 
 
 def _table_rate(log: PositionLog, one: PositionResult, rate: float | None, latitude: float | None) -> float:

@@ -72,6 +72,24 @@ def test_stated_sigmas_are_honest_over_specimens(method: str) -> None:
     assert 0.6 < float(np.mean(np.square(scores))) < 1.35
 
 
+def test_repeated_faces_know_the_slow_parts() -> None:
+    """In-run biases change from face to face: six faces cannot tell, twelve can, and their sigmas are honest."""
+    once, twice = [], []
+    for seed in range(30):
+        series = [simulate_positions("six-position", unit="STIM300", seed=seed, duration=20.0, series=k) for k in (0, 1)]
+        truth = series[0].accelerometer.bias
+        one = calibrated(series[0], "six-position")
+        assert any("take each face twice" in remark for remark in one.remarks)
+        logs = series[0].logs + tuple(replace(log, name=f"{log.name}b") for log in series[1].logs)
+        two = calibrate_imu(logs, ["six-position"], gravity=series[0].gravity, latitude=series[0].latitude)
+        assert not any("twice" in remark for remark in two.remarks)
+        for kept, got in ((once, one), (twice, two)):
+            triad = got.calibration.accelerometer
+            kept.append((triad.bias - truth) / triad.sigma_bias)
+    assert float(np.mean(np.square(twice))) < 1.6
+    assert float(np.mean(np.square(once))) > 1.5 * float(np.mean(np.square(twice)))
+
+
 def test_both_triads_in_one_go_and_what_is_kept() -> None:
     still = simulate_positions("multi-position", seed=3, count=12, duration=5.0)
     table = simulate_positions("modified-multi-position", seed=3, count=12, duration=5.0)
