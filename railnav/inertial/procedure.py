@@ -255,9 +255,8 @@ def _modified(
             axis = int(np.argmax(np.abs(turned)))
             scaled[k, axis] -= math.copysign(float(reference[k]) - nominal, turned[axis])
         up, down, counts, scatter = faces(found, scaled, "turning")
-        return replace(
-            six_position(up, down, nominal, sigma=repeated_sigma(sigma, counts, scatter, remarks, "gyros")),
-        )
+        sigma_face = repeated_sigma(sigma, counts, scatter, remarks, "gyros")
+        return replace(six_position(up, down, nominal, sigma=sigma_face), method="modified six-position")
     triad = multi_position(means, reference, form=form, sigma=sigma)
     triad = _widened(triad, sigma, partial(_norm, means, reference, form), remarks, "gyros")
     _advise_norm(triad, means, remarks)
