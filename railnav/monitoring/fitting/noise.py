@@ -32,7 +32,9 @@ _TRIALS = 32
 #: Longer waves bend no element: spacings, m.
 _LONGEST, _LONGEST_WAVE = 8.0, 120.0
 #: Waves must be likelier than none by this, in -2 log likelihood.
-_WORTH = 12.0
+_WORTH = 25.0
+#: Waves are at most this many times the white noise that differences a metre apart show: larger ones are the track's own.
+_LARGEST = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +151,7 @@ def likeliest(
     if sigma <= 1.01 * floor and stated is None:
         return plain  # exact points have no waves
     white = 0.3 * sigma if stated is None else stated
+    most = _LARGEST * sigma * max(1.0, spacing**-0.5)
     place = (float(np.log(white)), float(np.log(1.2 * sigma)), float(np.log(8.0 * spacing)))
     known = {place: cost(noise_of(place))}
     low = (np.log(floor), np.log(1e-3 * sigma), np.log(2.0 * spacing))
@@ -164,7 +167,8 @@ def likeliest(
                     there = (trial_place[0], trial_place[1], trial_place[2])
                     if there in known:
                         continue
-                    known[there] = cost(noise_of(there))
+                    trial = noise_of(there)
+                    known[there] = cost(trial) if trial.correlated <= most else np.inf
                     if known[there] < known[place] - 0.5:
                         place, moved = there, True
                         break
