@@ -14,7 +14,7 @@ from railnav.errors import RunError
 from railnav.matching.network import balises_of
 from railnav.navigation import columns as c
 from railnav.navigation.engine import Engine
-from railnav.navigation.epochs import COLUMNS, IDLE_STEP, IMU_STEP, SAME_TIME, Epoch
+from railnav.navigation.epochs import COLUMNS, IDLE_STEP, IMU_STEP, SAME_TIME, Epoch, LiveTable
 from railnav.navigation.explanation import Candidate, candidates_now
 from railnav.navigation.solution import Mode
 from railnav.navigation.state import Settings
@@ -176,7 +176,8 @@ class Navigator:
         self._inertial, self._force, self._force_time = imu, math.nan, -math.inf
         self._latest = _nowhere(model)
         self._balises = balises_of(model)
-        self._raw = np.empty((1, len(COLUMNS)))
+        self._live = LiveTable(model.frame, self._engine.latitude)
+        self._table = np.empty((1, c.EPOCH_SIZE))
         self._row = np.empty((1, c.OUTPUT_SIZE))
 
     @property
@@ -247,10 +248,11 @@ class Navigator:
                 epoch = replace(epoch, forward_force=self._force)
         elif self._inertial:
             self._force, self._force_time = epoch.forward_force, epoch.time
-        for i, name in enumerate(_NUMBERS):
-            self._raw[0, i] = getattr(epoch, name)
-        self._raw[0, len(_NUMBERS) :] = self._balises.get(epoch.balise, _NO_BALISE) if epoch.balise else _NO_BALISE
-        table = self._engine.table(self._raw)
+        balise = self._balises.get(epoch.balise, _NO_BALISE) if epoch.balise else _NO_BALISE
+        table = self._table
+        table[0] = self._live.row(epoch, balise)
+        table[0, c.EAST] -= self._engine.frame.east
+        table[0, c.NORTH] -= self._engine.frame.north
         out = self._row
         if 1.5 * IDLE_STEP < epoch.time - before < math.inf:
             steps = math.ceil((epoch.time - before) / IDLE_STEP - 1e-6)

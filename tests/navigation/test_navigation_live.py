@@ -128,3 +128,32 @@ def test_a_gap_of_five_minutes_is_survived(line):
     assert error.max() < 10.0
     assert (error <= solution.protection_level_along[inside]).all()
     assert solution.diagnostics["starts"] == 1
+
+
+def test_a_live_row_is_the_offline_row(line, ride):
+    """The expanded projection against the whole one, over the ride and a kilometre to the sides."""
+    from railnav.navigation.epochs import LiveTable, kernel_table, raw_table
+
+    run, _ = ride
+    raw = raw_table(run)
+    table = kernel_table(raw, line.frame, 0.88)
+    live = LiveTable(line.frame, 0.88)
+    for i, epoch in enumerate(epochs(run)):
+        row = np.array(live.row(epoch, (math.nan, math.nan)))
+        assert np.array_equal(np.isnan(row), np.isnan(table[i]))
+        assert np.nanmax(np.abs(row - table[i])) < 2e-5
+
+
+def test_memory_is_flat_over_a_long_ride(line, ride):
+    """What the navigator holds does not grow with the epochs."""
+    run, _ = ride
+    navigator = Navigator(line, lever_arm_b=run.gnss.lever_arm_b)
+    engine = navigator._engine
+    sizes = []
+    for i, epoch in enumerate(epochs(run)):
+        navigator.step(epoch)
+        if i in (10, 900):
+            held = [*engine.bank, *engine.work, *engine.records, engine.shared.ring, engine.journal.lines]
+            sizes.append(sum(array.nbytes for array in held))
+    assert sizes[0] == sizes[1]
+    assert len(navigator._waiting) == 0
