@@ -13,6 +13,7 @@ from railnav.errors import RunError
 from railnav.navigation.epochs import SIGMA_PER_HDOP, UNSTATED_SIGMA, Epoch
 from railnav.navigation.navigator import Alternative, Position
 from railnav.navigation.solution import Mode
+from railnav.navigation.state import Settings
 
 if TYPE_CHECKING:
     from railnav.track.model import TrackModel
@@ -21,6 +22,8 @@ FloatArray = NDArray[np.float64]
 
 #: Hypotheses kept, and the probability below which one is dropped.
 MOST, LEAST = 6, 1e-4
+#: How often tracks nearby that no hypothesis holds are given one, s, and its prior odds.
+RIVAL_STEP, RIVAL_PRIOR = 60.0, 0.01
 _GRAVITY = 9.80665
 
 
@@ -49,8 +52,8 @@ class ArcGains:
         s without a fix.
     speed_sigma : float
         Sigma of the speed that grows to an error along while no fix comes, m/s.
-    time_sigma : float
-        Of the stamps of the fixes, s: times the speed it is an error along.
+    time_sigma, time_sigma_alone : float
+        Of the stamps of the fixes, s: times the speed it is an error along; the second of loggers with GNSS alone, phones above all.
     way_sigma : float
         Share of the way run that an odometer may be wrong by.
     slip : float
@@ -69,6 +72,7 @@ class ArcGains:
     coasting_after: float = 3.0
     speed_sigma: float = 0.4
     time_sigma: float = 0.06
+    time_sigma_alone: float = 0.5
     way_sigma: float = 0.015
     slip: float = 1.5
     lost_fixes: int = 10
@@ -101,6 +105,8 @@ class ArcNavigator:
         What epochs bring of an odometer: "distance", "speed" or "".
     lever_arm_b : (3,) array
         Reference point to antenna, forward, right, down, m; only its length along counts here.
+    receiver : str
+        Kind of GNSS receiver, as `Settings.of_receiver` knows it: what its stated sigmas are worth.
     integrity_risk : float
         Risk, per epoch, of the protection level.
     gains : ArcGains, optional
@@ -127,6 +133,7 @@ class ArcNavigator:
         *,
         odometer: str = "",
         lever_arm_b: ArrayLike = (0.0, 0.0, 0.0),
+        receiver: str = "",
         integrity_risk: float = 1e-4,
         gains: ArcGains | None = None,
     ) -> None:
@@ -140,6 +147,8 @@ class ArcNavigator:
         self._odometer = odometer
         self._arm = float(np.asarray(lever_arm_b, dtype=np.float64)[0])
         self._gains = gains or ArcGains()
+        kind = Settings.of_receiver(receiver)
+        self._worth = max(1.0, math.hypot(kind.scale_start, kind.gnss_frame_share))
         self._quantile = NormalDist().inv_cdf(1.0 - 0.5 * integrity_risk)
         self._risk = integrity_risk
         self._begin = model.offset[model.knot_start[:-1]].tolist()
@@ -155,10 +164,13 @@ class ArcNavigator:
         self._distance = math.nan
         self._last_fix: tuple[float, float, float] | None = None  # time, easting, northing
         self._last_velocity: tuple[float, float] | None = None
+        self._anchor: tuple[float, float, float] | None = None
         self._since_way = 0.0
         self._sigma = UNSTATED_SIGMA
         self._missed = 0
+        self._rivals_at = -math.inf
         self._started = False
+        self._aided = bool(odometer)
         self._slip_until, self._slip_speed = -math.inf, 0.0
 
     @property
@@ -201,6 +213,7 @@ class ArcNavigator:
 
     def _predict(self, epoch: Epoch, step: float) -> None:
         """Move all places by what odometer or accelerometer say."""
+        self._aided = self._aided or math.isfinite(epoch.forward_force)
         moved, before = None, self._speed
         if self._odometer == "distance" and math.isfinite(epoch.distance):
             if math.isfinite(self._distance):
@@ -263,10 +276,11 @@ class ArcNavigator:
         sigma = math.sqrt(0.5 * (epoch.sigma_east**2 + epoch.sigma_north**2))
         if not math.isfinite(sigma) or sigma <= 0.0:
             sigma = SIGMA_PER_HDOP * epoch.hdop if math.isfinite(epoch.hdop) else UNSTATED_SIGMA
+        sigma *= self._worth
         last, self._last_fix = self._last_fix, (epoch.time, easting, northing)
         interval = epoch.time - last[0] if last is not None else 1.0
         if not self._places:
-            self._acquire(epoch, easting, northing, sigma, last)
+            self._acquire(epoch, easting, northing, sigma)
             return
         seen = []
         for place in self._places:
@@ -285,6 +299,10 @@ class ArcNavigator:
             place.across += share * (cross - place.across)
             place.log_weight = place.prior - 0.5 * (place.across / (self._gains.evidence_sigma * sigma)) ** 2
         self._correct([a for a, _ in seen], min(interval, 10.0), epoch)
+        if epoch.time - self._rivals_at >= RIVAL_STEP:
+            self._rivals_at = epoch.time
+            self._add_rivals(easting, northing, sigma)
+            good += [True] * (len(self._places) - len(good))
         kept: list[_Place] = []
         for place, inside in zip(self._places, good, strict=True):
             if inside:
@@ -318,26 +336,47 @@ class ArcNavigator:
         for place, a in zip(self._places, along, strict=True):
             place.offset += alpha * a
 
-    def _acquire(
-        self, epoch: Epoch, easting: float, northing: float, sigma: float, last: tuple[float, float, float] | None
-    ) -> None:
+    def _add_rivals(self, easting: float, northing: float, sigma: float) -> None:
+        """Give every track nearby that no place holds and that runs our way a faint one: the model may lack a crossover, or we may err."""
+        best = max(self._places, key=lambda p: p.log_weight)
+        self._at(best.track, best.offset)
+        bearing = float(self._point[3]) + (0.0 if best.way > 0 else math.pi)
+        held = {p.track for p in self._places}
+        for candidate in self._model.locate(easting, northing, within=3.0 * sigma):
+            track = self._model.track_index(candidate.track)
+            if track in held:
+                continue
+            self._at(track, candidate.offset)
+            agree = math.cos(float(self._point[3]) - bearing)
+            if abs(agree) < 0.9:
+                continue
+            way = 1 if agree > 0 else -1
+            place = _Place(track, candidate.offset - way * self._arm, way, best.prior + math.log(RIVAL_PRIOR))
+            place.across = self._apart(place, easting, northing)[1]
+            place.log_weight = place.prior - 0.5 * (place.across / (self._gains.evidence_sigma * sigma)) ** 2
+            self._places.append(place)
+
+    def _acquire(self, epoch: Epoch, easting: float, northing: float, sigma: float) -> None:
         """Begin on every track near a moving train's fix that runs its way."""
         if math.isfinite(epoch.speed) and math.isfinite(epoch.course):
             speed = epoch.speed
             bearing = epoch.course - float(self._model.frame.convergence(easting, northing))
         elif math.isfinite(epoch.speed) and epoch.speed < 2.0:
             return
-        elif last is not None and 0.0 < epoch.time - last[0] < 10.0:
-            ve, vn = (easting - last[1]) / (epoch.time - last[0]), (northing - last[2]) / (epoch.time - last[0])
-            before, self._last_velocity = self._last_velocity, (ve, vn)
+        else:
+            anchor = self._anchor
+            if anchor is None or epoch.time - anchor[0] > 30.0:
+                self._anchor, self._last_velocity = (epoch.time, easting, northing), None
+                return
+            interval = epoch.time - anchor[0]
+            ve, vn = (easting - anchor[1]) / interval, (northing - anchor[2]) / interval
             speed, bearing = math.hypot(ve, vn), math.atan2(ve, vn)
+            if speed * interval < max(3.0 * sigma, 10.0):
+                return
             # one wild fix makes one wild speed: two in a row must agree
+            before, self._last_velocity, self._anchor = self._last_velocity, (ve, vn), (epoch.time, easting, northing)
             if before is None or math.hypot(ve - before[0], vn - before[1]) > 0.3 * speed:
                 return
-            if speed * (epoch.time - last[0]) < 3.0 * sigma:
-                return
-        else:
-            return
         if speed < 2.0:
             return
         for candidate in self._model.locate(easting, northing, within=4.0 * sigma + 10.0):
@@ -354,6 +393,7 @@ class ArcNavigator:
         if self._places:
             self._speed, self._bias, self._sigma, self._since_way = speed, 0.0, sigma, 0.0
             self._started = True
+            self._rivals_at = epoch.time
             kept: list[_Place] = []
             for place in self._places:
                 kept += self._followed(place, 0)
@@ -430,7 +470,8 @@ class ArcNavigator:
         grown = (
             gains.way_sigma * self._since_way if self._odometer else gains.speed_sigma * since + 0.025 * since * since
         )
-        sigma = math.hypot(self._sigma, grown, gains.time_sigma * self._speed)
+        stamp = gains.time_sigma if self._aided else gains.time_sigma_alone
+        sigma = math.hypot(self._sigma, grown, stamp * self._speed)
         probability = min(1.0, weight[best.track])
         mode = Mode.TRACKING
         if probability < gains.confidence:

@@ -61,7 +61,12 @@ def navigate_arc(
     table = list(epochs(run))
     assert gnss is not None
     navigator = ArcNavigator(
-        model, odometer=reads, lever_arm_b=gnss.lever_arm_b, integrity_risk=integrity_risk, gains=gains
+        model,
+        odometer=reads,
+        lever_arm_b=gnss.lever_arm_b,
+        receiver=gnss.receiver,
+        integrity_risk=integrity_risk,
+        gains=gains,
     )
     m = len(table)
     rows = np.full((m, 7), np.nan)
