@@ -24,6 +24,7 @@ TABLE_ENDINGS = (".csv", ".parquet")
 )
 @click.option("--design-crs", help="Plane of the design, where its file does not say.  [default: the model's]")
 @click.option("--report", type=PATH, help="Also write a page about the plan, .html.")
+@click.option("--axis", type=PATH, help="Also write the lined axis as a model: .gpkg, .geojson, .xml (LandXML), ...")
 @click.option(
     "--tracks",
     metavar="TRACK,TRACK",
@@ -66,6 +67,7 @@ def command(
     design: Path | None,
     design_crs: str | None,
     report: Path | None,
+    axis: Path | None,
     tracks: str | None,
     step: float,
     cutoff: float,
@@ -99,6 +101,8 @@ def command(
     if report is not None:
         _files.check_output(report, _files.PAGE_ENDINGS, inputs=[*inputs, output])
         _files.need_report()
+    if axis is not None:
+        _files.check_output(axis, _files.EXPORT_ENDINGS, inputs=[*inputs, output, *([report] if report else [])])
     if least_lift > most_lift:
         raise click.UsageError(f"--least-lift {least_lift:g} is above --most-lift {most_lift:g}")
     from railnav.io.lining import read_fixed_points, write_plan
@@ -117,12 +121,12 @@ def command(
     names = [name.strip() for name in tracks.split(",") if name.strip()] if tracks is not None else []
     limits = LiningLimits(most_slew / 1e3, least_lift / 1e3, most_lift / 1e3, curvature_rate, curvature_rate)
     with progress() as tell:
-        axis, surveyed = measured_section([read_run(run) for run in runs], reference, tracks=names, progress=tell)
-        slews, lifts = read_fixed_points(fixed, axis.section) if fixed is not None else ((), ())
+        measured, surveyed = measured_section([read_run(run) for run in runs], reference, tracks=names, progress=tell)
+        slews, lifts = read_fixed_points(fixed, measured.section) if fixed is not None else ((), ())
         if tell:
             tell("line", 0, 1)
         plan = line_up(
-            axis,
+            measured,
             designs=designs,
             step=step,
             cutoff=cutoff,
@@ -139,14 +143,18 @@ def command(
 
         page = lining_page(plan)
     write_plan(plan, output)
+    if axis is not None:
+        from railnav.monitoring.lined import lined_model
+
+        _files.write_model(lined_model(plan), axis)
     if report is not None and page is not None:
         _files.write_text(report, page)
     if as_json:
-        print_json({**facts(plan), "output": output, "report": report})
+        print_json({**facts(plan), "output": output, "report": report, "axis": axis})
         return
     print_warnings(plan.notes)
     _print(plan)
-    click.echo(f"{', '.join(str(path) for path in (output, report) if path is not None)} written")
+    click.echo(f"{', '.join(str(path) for path in (output, report, axis) if path is not None)} written")
 
 
 def facts(plan: LiningPlan) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from railnav.monitoring.design import Design
 from railnav.monitoring.filters import D1, D2, D3_ALIGNMENT, D3_LEVEL, Band, band_pass, low_pass, stretches
 from railnav.monitoring.position import MeasuredAxis
 from railnav.monitoring.section import Section
-from railnav.monitoring.smoothing import Bounds, FixedPoint, corrections, whittaker
+from railnav.monitoring.smoothing import Bounds, FixedPoint, InfeasibleError, corrections, whittaker
 from railnav.monitoring.versines import Chord, closed_versines, hallade, versines_in_plan
 
 FloatArray = NDArray[np.float64]
@@ -186,7 +186,7 @@ def line_up(
     model = section.at(d)
     right, up = measured.right[part], measured.up[part]
     sin, cos = np.sin(model.grid_bearing), np.cos(model.grid_bearing)
-    scale = _grid_scale(section, d)
+    scale = grid_scale(section, d)
     east, north = model.easting + right * scale * cos, model.northing - right * scale * sin
     height = model.height + up
     station = np.full(len(d), np.nan)
@@ -221,13 +221,13 @@ def line_up(
     s = d[nodes]
     target = np.zeros(len(y)) if name else whittaker(y, step, cutoff)
     bounds = Bounds(-limits.most_slew, limits.most_slew, limits.curvature_rate)
-    slew = corrections(y, target, step, bounds, fixed=fixed_slew, start=float(s[0]))
+    slew = _corrected(measured, y, target, step, bounds, fixed_slew, float(s[0]))
     lift, z = np.full(len(s), np.nan), np.full(len(s), np.nan)
     if np.isfinite(level).all():
         z = _noded(level, measured.step, step, nodes)
         goal = z if free_level else np.zeros(len(z))
         rise = Bounds(limits.least_lift, limits.most_lift, limits.gradient_rate)
-        lift = corrections(z, goal, step, rise, fixed=fixed_lift, start=float(s[0]))
+        lift = _corrected(measured, z, goal, step, rise, fixed_lift, float(s[0]))
     else:
         notes.append("no heights along the whole stretch: no lifts")
     fine_slew, fine_lift = _between(s, slew, d), _between(s, lift, d)
@@ -266,6 +266,25 @@ def line_up(
     )
 
 
+def _corrected(
+    measured: MeasuredAxis,
+    deviation: FloatArray,
+    target: FloatArray,
+    step: float,
+    bounds: Bounds,
+    fixed: Sequence[FixedPoint],
+    start: float,
+) -> FloatArray:
+    """Corrections, or why there are none: also that the axis itself is not known well enough for such limits."""
+    try:
+        return corrections(deviation, target, step, bounds, fixed=fixed, start=start)
+    except InfeasibleError as error:
+        if measured.sigma_right <= USABLE:
+            raise
+        known = f"to {measured.sigma_right:.2f} m" if math.isfinite(measured.sigma_right) else "with no stated accuracy"
+        raise InfeasibleError(f"{error}; note that the axis is only known {known}, too coarse for lining") from error
+
+
 def _longest(measured: MeasuredAxis, notes: list[str]) -> slice:
     parts = stretches(np.isfinite(measured.right))
     if not parts:
@@ -281,7 +300,7 @@ def _longest(measured: MeasuredAxis, notes: list[str]) -> slice:
     return slice(a, b)
 
 
-def _grid_scale(section: Section, distance: FloatArray) -> FloatArray:
+def grid_scale(section: Section, distance: FloatArray) -> FloatArray:
     """Grid metres per ground metre along the section."""
     model = section.model
     track, offset = section.locate(distance)

@@ -330,6 +330,28 @@ def test_a_plan_is_written_and_fixed_points_are_read(tmp_path):
         read_fixed_points(file, section())
 
 
+def test_the_lined_axis_is_a_model_where_the_plan_moves_the_track():
+    from railnav.monitoring.lined import lined_model
+
+    n = 1200
+    wave = 0.03 * np.sin(2 * np.pi * np.arange(n) * 0.5 / 60.0) * np.sin(np.pi * np.arange(n) / (n - 1))
+    plan = line_up(axis(wave, np.zeros(n)), step=5.0)
+    made = lined_model(plan)
+    where = line()
+    for d in (100.0, 300.0, 500.0):
+        foot = where.locate(
+            float(made.at(made.track_id[0], d).easting), float(made.at(made.track_id[0], d).northing), within=1.0
+        )[0]
+        assert foot.cross == pytest.approx(float(np.interp(foot.offset, plan.distance, plan.right_after)), abs=1e-3)
+    assert made.length(made.track_id[0]) == pytest.approx(plan.distance[-1], abs=0.01)
+
+
+def test_an_axis_that_is_not_known_is_said_when_limits_fail():
+    y = 0.05 * np.sin(np.arange(1200) * 0.5 * 2 * np.pi / 30.0)
+    with pytest.raises(InfeasibleError, match=r"only known to 1\.90 m, too coarse for lining"):
+        line_up(replace(axis(y), sigma_right=1.9), limits=LiningLimits(most_slew=0.002))
+
+
 def test_gaps_and_short_stretches():
     y = np.zeros(800)
     y[300:320] = np.nan
