@@ -190,7 +190,9 @@ def fit_design(
         items = judgement.items_of(fit.chain)
         if not any(a.k0 * a.k1 < 0.0 for a in items):
             break
-        fit = fit_plan(judgement.chain_of(judgement.split_inflections(items)), fit.along, east, north, per_point)
+        parted = judgement.chain_of(judgement.split_inflections(items))
+        again = fit_plan(parted, fit.along, east, north, per_point)
+        fit = again if again.cost < 1.2 * fit.cost else fit_plan(parted, fit.along, east, north, per_point, steps=0)
     fit = _without_stubs(fit, east, north, per_point)
     tell(label, 3, total)
     if not fit.settled:
@@ -431,6 +433,8 @@ def _with_laws(
     else:
         start = fits[best].chain if not stay.any() and (law_of == best).all() else judgement.chain_of(merged)
         chosen = fit_plan(judgement.with_law(start, law_by_item), fit.along, east, north, sigma)
+    if chosen.cost > fit.cost + spread * (_DEARER * (sum(e.fewer for e in kept) + len(spans)) + LAW_WORTH):
+        return fit, float("nan"), ""  # the steps did not lead there
     return chosen, float(margin), elements.KIND_NAMES[second]
 
 
