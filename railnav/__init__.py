@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from railnav.errors import RailnavError
     from railnav.evaluation import evaluate
     from railnav.io.geojson import read_geojson
+    from railnav.io.network import read_network
     from railnav.io.solution import read_solution
     from railnav.io.truth import read_truth
     from railnav.navigation import Mode, Navigator, Solution, navigate
@@ -62,6 +63,7 @@ _HOME = {
     "evaluate": "railnav.evaluation",
     "navigate": "railnav.navigation",
     "read_geojson": "railnav.io.geojson",
+    "read_network": "railnav.io.network",
     "read_solution": "railnav.io.solution",
     "read_truth": "railnav.io.truth",
     "simulate": "railnav.simulation",
@@ -83,6 +85,7 @@ __all__ = [
     "evaluate",
     "navigate",
     "read_geojson",
+    "read_network",
     "read_solution",
     "read_truth",
     "simulate",

@@ -164,30 +164,11 @@ def kind_of(path: Path) -> Kind:
     )
 
 
-def xml_kind(path: Path) -> str:
-    """Name of the root element of an XML file, by its first bytes; empty where there is none."""
-    import re
-
-    with path.open("rb") as file:
-        head = file.read(65536)
-    code = "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8"
-    text = re.sub(r"<[?!][^>]*>|<!--.*?-->", "", head.decode(code, "replace"), flags=re.DOTALL)
-    found = re.search(r"<(?:[\w.-]+:)?([\w.-]+)", text)
-    return found[1] if found else ""
-
-
 def columns(path: Path) -> set[str]:
     """Names in the header of a table, .csv or .parquet."""
-    if path.suffix.lower() == ".csv":
-        with path.open("rb") as file:
-            return {name.strip().strip('"') for name in file.readline(65536).decode("utf-8", "replace").split(",")}
-    import pyarrow as pa
-    import pyarrow.parquet as pq
+    from railnav.io.tables import header_of
 
-    try:
-        return set(pq.read_schema(path).names)
-    except pa.ArrowException as error:
-        raise InputError(f"not a Parquet file ({error})", file=path) from error
+    return header_of(path)
 
 
 def _kind_of_geopackage(path: Path) -> Kind:

@@ -16,13 +16,14 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from railnav.errors import CrsError, InputError
+from railnav.errors import CrsError, InputError, TrackError
 from railnav.geodesy.grid import frame_for_grid
 from railnav.io.design import (
     ARC,
     BLOSS,
     CLOTHOID,
     COSINE,
+    CUBIC,
     HELMERT,
     LARGEST_GAP,
     LARGEST_KINK,
@@ -74,8 +75,11 @@ _SPIRALS = {
     "biquadratic": HELMERT,
     "wienerbogen": VIENNESE,
     "weinerbogen": VIENNESE,  # as the schema spells it
+    "cubicparabola": CUBIC,
 }
-_KNOWN = "clothoid, bloss, cosine, sinusoid (Klein), biquadratic (Helmert), wienerBogen"
+_KNOWN = "clothoid, bloss, cosine, sinusoid (Klein), biquadratic (Helmert), wienerBogen, cubicParabola"
+#: A cubic parabola ends within this of its stated end, m: a clothoid, or another curve of that name, is some millimetres off or more.
+_CUBIC_GAP = 2e-3
 
 _ANGLES = {
     "radians": 1.0,
@@ -127,8 +131,9 @@ def read_landxml(path: str | Path, *, crs: Any = None, spacing: float = 1.0) -> 
     -----
     Positions are integrated as for elements (`railnav.io.design`). Vertical curves are exact: parabolas of ParaCurve and UnsymParaCurve,
     circles of CircCurve. The height of the centre of gravity that a Viennese bend is made for is no part of LandXML; it follows
-    from the stated end point, and is refused outside 0.5 to 3 m where the cant is known. Cubic, radioid, sine half-wave and
-    reversed transitions are refused by name, not approximated.
+    from the stated end point, and is refused outside 0.5 to 3 m where the cant is known. A cubicParabola is exact in arc length
+    (`railnav.track.elements`) and must end within 2 mm of its End. Cubic, radioid, sine half-wave and reversed transitions are refused by
+    name, not approximated.
 
     References
     ----------
@@ -144,12 +149,19 @@ def read_landxml(path: str | Path, *, crs: Any = None, spacing: float = 1.0) -> 
     if not spacing > 0.0:
         raise InputError(f"knot spacing {spacing} m is not positive", file=path, remedy="use 1 m")
     root = _document(path)
-    crs = _stated_plane(root, path) if crs is None else crs
+    named = _named_plane(root)
+    if crs is None and not named:
+        raise InputError(
+            "grid coordinates need the plane they lie in", file=path, remedy="name it, e.g. --crs EPSG:31467"
+        )
     unit = _direction_unit(root, path)
     found = [node for node in root.iter() if _local(node) == "Alignment"]
     if not found:
         raise InputError("has no Alignment", file=path, remedy="export the track's alignments, with CoordGeom")
     notes: list[str] = []
+    if crs is not None and named and str(crs) != named:
+        notes.append(f"the file names {named[:60]}, but --crs counts: {str(crs)[:60]}")
+    crs = named if crs is None else crs
     alignments = [_read_alignment(path, node, unit, notes) for node in found]
     seen: set[str] = set()
     for alignment in alignments:
@@ -201,8 +213,8 @@ def _document(path: Path) -> Any:
     return root
 
 
-def _stated_plane(root: Any, path: Path) -> str:
-    """The plane that the file names: its EPSG code, or its well-known text."""
+def _named_plane(root: Any) -> str:
+    """The plane that the file names, its EPSG code or its well-known text; empty where it names none."""
     for system in _children(root, "CoordinateSystem"):
         code = str(system.get("epsgCode", "")).strip().removeprefix("EPSG:")
         if code.isdigit() and len(code) < 7:
@@ -210,7 +222,7 @@ def _stated_plane(root: Any, path: Path) -> str:
         text = str(system.get("ogcWktCode", "")).strip()
         if text[:5].upper() in ("PROJC", "BOUND", "COMPO", "DERIV"):
             return text[:20_000]
-    raise InputError("grid coordinates need the plane they lie in", file=path, remedy="name it, e.g. --crs EPSG:31467")
+    return ""
 
 
 def _features(node: Any) -> dict[str, str]:
@@ -402,11 +414,20 @@ def _read_plan(place: _Place, node: Any, notes: list[str]) -> tuple[Plan, list[A
     )
     if plan.edges[-1] > 5e6:
         place.refuse(geometry[0], f"is {plan.edges[-1] / 1e3:.0f} km long", "check the lengths")
-    plan = _swing(place, node, nodes, plan, end)
-    gap, kink = closing(plan, end=end[-1])
+    try:
+        plan = _swing(place, node, nodes, plan, end)
+        gap, kink = closing(plan, end=end[-1])
+    except TrackError as error:  # a cubic parabola that cannot be
+        place.refuse(geometry[0], str(error))
     shut = np.hypot(gap[:, 0], gap[:, 1])
     ends, _ = integrate(plan, plan.edges)
     own = np.hypot(*(end - ends[1:]).T)
+    for i in np.flatnonzero((plan.kind == CUBIC) & (own > _CUBIC_GAP)).tolist():
+        place.refuse(
+            nodes[i],
+            f"spiType 'cubicParabola': one of this length and radius ends {own[i] * 1e3:.1f} mm from its End",
+            "it is another curve: say which, or use clothoid",
+        )
     for i in range(len(rows)):
         apart, what = (own[i], "its own end") if own[i] > shut[i] else (shut[i], "the start of the next element")
         if apart > LARGEST_GAP:

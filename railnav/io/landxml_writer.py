@@ -17,7 +17,7 @@ import numpy as np
 
 from railnav.errors import InputError
 from railnav.io.atomic import atomic_path
-from railnav.io.design import ARC, BLOSS, CLOTHOID, COSINE, HELMERT, SINE, STRAIGHT, VIENNESE, integrate
+from railnav.io.design import ARC, BLOSS, CLOTHOID, COSINE, CUBIC, HELMERT, SINE, STRAIGHT, VIENNESE, integrate
 from railnav.io.designed import DesignedAlignment, designed_tracks
 from railnav.track.model import TrackModel
 
@@ -29,6 +29,7 @@ SPIRALS = {
     SINE: "sinusoid",
     HELMERT: "biquadratic",
     VIENNESE: "weinerBogen",  # as the schema spells it
+    CUBIC: "cubicParabola",
 }
 #: Mark of the Feature that carries what LandXML has no place for.
 FEATURE = "railnav"

@@ -333,6 +333,9 @@ def _frame(
             element.point = np.column_stack(frame.to_grid(np.radians(y), np.radians(x), z))
         return frame, True
     plane = f"EPSG:{code}" if code.isdigit() else definition or crs
+    if definition and crs is not None and str(crs) != str(plane):
+        reader.note(f"the file names {definition[:60]}, but --crs counts: {str(crs)[:60]}")
+        plane = crs
     if plane is None:
         raise InputError(
             "does not state the coordinate system of its positions (crsDefinition)",

@@ -208,6 +208,21 @@ def check_table(table: Table, columns: Sequence[Column]) -> None:
             table.refuse(index, column.name, cause, "leave the cell empty where nothing is known")
 
 
+def header_of(path: Path) -> set[str]:
+    """Names in the header of a table, .csv or .parquet."""
+    if path.suffix.lower() not in PARQUET_ENDINGS:
+        with path.open("rb") as file:
+            head = file.readline(65536).removeprefix(codecs.BOM_UTF8)
+            return {name.strip().strip('"') for name in head.decode("utf-8", "replace").split(",")}
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    try:
+        return set(parquet.read_schema(path).names)
+    except (pa.ArrowException, OSError) as error:
+        raise InputError(f"not a Parquet file ({str(error)[:200]})", file=path) from error
+
+
 def freeze(array: NDArray[Any]) -> NDArray[Any]:
     """Give the array, contiguous and read-only."""
     array = np.ascontiguousarray(array)

@@ -142,13 +142,25 @@ def test_a_wrong_transition_type_is_refused(read):
         read(text.replace('"bloss"', '"clothoid"'))
 
 
-@pytest.mark.parametrize(
-    "kind", ["cubic", "revBloss", "sineHalfWave", "radioid", "japaneseCubic", "cubicParabola", "spline"]
-)
+@pytest.mark.parametrize("kind", ["cubic", "revBloss", "sineHalfWave", "radioid", "japaneseCubic", "spline"])
 def test_unknown_transitions_are_refused_by_name(read, kind):
     text = document(alignment(Pen().spiral(100, math.inf, 600, "cw", "clothoid"))).replace('"clothoid"', f'"{kind}"')
     with pytest.raises(InputError, match=f"spiType '{kind}' is not read; known are clothoid"):
         read(text)
+
+
+def test_a_cubic_parabola_must_be_one(read):
+    """A clothoid of L = 100 m, R = 600 m called a cubic parabola ends 27 mm off: its length is not that of its tangent."""
+    text = document(alignment(Pen().spiral(100, math.inf, 600, "cw", "clothoid"))).replace(
+        '"clothoid"', '"cubicParabola"'
+    )
+    with pytest.raises(
+        InputError, match=r"spiType 'cubicParabola': one of this length and radius ends \d+\.\d mm from its End"
+    ):
+        read(text)
+    both = document(alignment(Pen().spiral(100, 900, 600, "cw", "clothoid"))).replace('"clothoid"', '"cubicParabola"')
+    with pytest.raises(InputError, match="cubic parabola between two arcs"):
+        read(both)
 
 
 def test_the_swing_of_a_viennese_bend_follows_from_its_end(read):

@@ -11,7 +11,20 @@ from hypothesis import strategies as st
 
 from railnav.errors import InputError, TrackError
 from railnav.geodesy.grid import frame_for_grid
-from railnav.io.design import ARC, BLOSS, CLOTHOID, COSINE, HELMERT, SINE, STRAIGHT, VIENNESE, Cant, Plan, integrate
+from railnav.io.design import (
+    ARC,
+    BLOSS,
+    CLOTHOID,
+    COSINE,
+    CUBIC,
+    HELMERT,
+    SINE,
+    STRAIGHT,
+    VIENNESE,
+    Cant,
+    Plan,
+    integrate,
+)
 from railnav.io.designed import DesignedAlignment, VerticalPoints, designed_track, designed_tracks
 from railnav.io.landxml import read_landxml
 from railnav.io.landxml_writer import write_landxml
@@ -119,6 +132,18 @@ def test_designed_elements_keep_their_kind(tmp_path, kind, side):
     assert float(here.height[1]) == pytest.approx(401.5, abs=1e-4)
     assert float(model.at("T", 0.0).chainage) == pytest.approx(1200.5)
     assert float(model.at("T", model.length("T")).chainage) == pytest.approx(5000.0 - 120.0, abs=2e-2)
+
+
+def test_cubic_parabolas_keep_their_kind(tmp_path):
+    k = -1 / 450.0
+    rows = [(50.0, STRAIGHT, 0.0, 0.0), (80.0, CUBIC, 0.0, k), (120.0, ARC, k, k), (60.0, CUBIC, k, 0.0)]
+    plan = chained(rows)
+    write_landxml([DesignedAlignment("T", plan)], tmp_path / "t.xml")
+    assert (tmp_path / "t.xml").read_text().count('spiType="cubicParabola"') == 2
+    model = read_landxml(tmp_path / "t.xml", crs=CRS)
+    assert model.provenance["import"]["largest_gap_m"] < 2e-6
+    at, _ = integrate(plan, plan.edges)
+    assert np.hypot(model.easting[-1] - at[-1, 0], model.northing[-1] - at[-1, 1]) < 1e-5
 
 
 def test_a_track_without_chainage_comes_back_without(tmp_path):
