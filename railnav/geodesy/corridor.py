@@ -263,6 +263,8 @@ def _section(
     base: Any,
     name: str,
 ) -> Section:
+    from pyproj import Proj
+
     bend = np.abs(np.diff(np.unwrap(bearing), 2, prepend=0.0, append=0.0)) + np.abs(
         np.diff(up, 2, prepend=0.0, append=0.0)
     )
@@ -280,9 +282,9 @@ def _section(
         if largest < value * 0.999:
             best, value = found, largest
     centre_lat, centre_lon, azimuth, k0 = _numbers(best, start)
-    plain = choose_frame(lat, lon, crs=_oblique_mercator(base, name, centre_lat, centre_lon, azimuth, k0))
-    reach = [0.5 * (float(v.min()) + float(v.max())) for v in plain.to_grid(lat, lon, None)[:2]]
-    false_east, false_north = (round((FALSE - v) / 1e3) * 1e3 for v in reach)
+    text = f"+proj=omerc +lat_0={centre_lat!r} +lonc={centre_lon!r} +alpha={azimuth!r} +gamma={azimuth!r} +k_0={k0!r} +ellps=WGS84"
+    plane = Proj(text)(np.degrees(lon), np.degrees(lat))
+    false_east, false_north = (round((FALSE - 0.5 * (float(v.min()) + float(v.max()))) / 1e3) * 1e3 for v in plane)
     system = _oblique_mercator(base, name, centre_lat, centre_lon, azimuth, k0, false_east, false_north)
     frame = choose_frame(lat, lon, crs=system)
     parameters = {

@@ -104,6 +104,37 @@ def test_bad_points_are_named(parameters, bad):
     assert (~kept.used).sum() == len(bad)
 
 
+def test_bad_points_that_agree_with_each_other():
+    """Four marks of twelve, all moved the same way: together they drag the fit, and one by one none stands out."""
+    latitude, longitude, height, grid, _ = points(12, sigma=0.01, reach=0.3, seed=8)
+    bad = np.argsort(longitude)[:4]
+    grid[bad, :2] += (0.3, 0.2)
+    fit = fit_datum(latitude, longitude, height, *grid.T, crs=LOCAL)
+    assert np.flatnonzero(~fit.used).tolist() == sorted(bad.tolist())
+    assert fit.sigma < 0.02
+
+
+def test_sigmas_of_parameters_are_true():
+    """Errors over stated sigma of rotation about the vertical, scale and shift amid the points, 60 draws."""
+    scores = []
+    exact = fit_datum(*points(8, seed=77)[:3], *points(8, seed=77)[3].T, crs=LOCAL).parameters
+    for seed in range(60):
+        latitude, longitude, height, grid, _ = points(8, seed=77)
+        random = np.random.default_rng(seed)
+        grid[:, :2] += 0.03 * random.standard_normal((8, 2))
+        grid[:, 2] += 0.06 * random.standard_normal(8)
+        fit = fit_datum(latitude, longitude, height, *grid.T, crs=LOCAL, sigma=0.03, keep_all=True)
+        scores.append(
+            [
+                (fit.parameters[k] - exact[k]) / fit.sigmas[k]
+                for k in ("rx_arcsec", "ry_arcsec", "rz_arcsec", "scale_ppm")
+            ]
+        )
+    mean_square = np.mean(np.square(scores), axis=0)
+    assert (mean_square > 0.4).all()
+    assert (mean_square < 1.8).all()
+
+
 def test_good_points_are_kept():
     """At 1 % for a set, 40 sets lose a point about every third time: never three."""
     lost = 0

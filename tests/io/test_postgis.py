@@ -153,6 +153,25 @@ def test_one_writer_at_a_time(server, model, monkeypatch):
     assert postgis.write_model(model, address) == 2
 
 
+def test_a_reader_keeps_its_snapshot(server, model, monkeypatch):
+    """The version is deleted under a reader that has found it: the reader still gets it whole."""
+    address = f"{server}?model=snapshot"
+    postgis.write_model(model, address)
+    find = postgis._find
+
+    def find_and_lose(connection, where):
+        found = find(connection, where)
+        with psycopg.connect(server) as other:
+            other.execute("DELETE FROM railnav.model WHERE name = 'snapshot'")
+        return found
+
+    monkeypatch.setattr(postgis, "_find", find_and_lose)
+    same(TrackModel.read(address), model)
+    monkeypatch.undo()
+    with pytest.raises(ModelError, match="has no model 'snapshot'"):
+        TrackModel.read(address)
+
+
 def test_writers_at_once_make_versions_in_turn(server, model):
     address, made = f"{server}?model=race", []
     small = model
