@@ -144,7 +144,8 @@ def diagnose_imu(
         and gyro_tolerance >= 0.0
     ):
         raise ValueError("gravity must be positive, false_alarm between 0 and 1, tolerances not negative")
-    still = [log for log, turning in zip(logs, which_turn(logs), strict=True) if not turning]
+    known = None if calibration.gyroscope is None else calibration.gyroscope.bias
+    still = [log for log, turning in zip(logs, which_turn(logs, bias=known), strict=True) if not turning]
     if not still:
         raise EstimationError("no position at rest: diagnosis needs the unit standing still, in nine or more attitudes")
     defects, names, force, rate = [], [], [], []

@@ -236,7 +236,7 @@ def position_result(log: PositionLog, *, turning: bool = False) -> PositionResul
     return PositionResult(log.name, up_words(direction), force, rate, turning, kelvin, float(np.ptp(imu.time)))
 
 
-def which_turn(logs: Sequence[PositionLog], *, rate: float | None = None) -> list[bool]:
+def which_turn(logs: Sequence[PositionLog], *, rate: float | None = None, bias: FloatArray | None = None) -> list[bool]:
     """Which logs were taken while the block turned.
 
     Parameters
@@ -245,16 +245,19 @@ def which_turn(logs: Sequence[PositionLog], *, rate: float | None = None) -> lis
         As measured.
     rate : float, optional
         Of a table on which all logs were taken, rad/s.
+    bias : (3,) array, optional
+        Of the gyros, where known, rad/s.
 
     Returns
     -------
     list of bool
         True where the log names a rate, or where its median rate differs from the median over all logs, which is the gyros' bias if the
-        positions are spread evenly, by more than `TURNING` (or half of `rate`). With fewer than five logs the bias is not known and the
-        rate itself is taken.
+        positions are spread evenly, by more than `TURNING` (or half of `rate`). With fewer than five logs and no `bias` the rate itself
+        is taken.
     """
     medians = np.array([np.median(log.imu.gyro, axis=0) for log in logs])
-    bias = np.median(medians, axis=0) if len(logs) >= 5 else np.zeros(3)
+    if bias is None:
+        bias = np.median(medians, axis=0) if len(logs) >= 5 else np.zeros(3)
     least = TURNING if rate is None else 0.5 * abs(rate)
     out = []
     for log, median in zip(logs, medians, strict=True):

@@ -73,6 +73,15 @@ def test_fewer_positions_control_but_do_not_isolate() -> None:
     assert "add positions with these axes up" in got.advice
 
 
+def test_few_logs_of_a_gyro_with_a_large_bias_still_count_as_rest() -> None:
+    made = simulate_positions("multi-position", seed=3, unit="L3G4200D", count=18, duration=5.0)
+    assert np.linalg.norm(made.gyroscope.bias) > math.radians(15.0)
+    unit = calibrate_imu(made.logs, ["multi-position"], gravity=made.gravity, latitude=made.latitude).calibration
+    got = diagnose_imu(made.logs[:3], unit, gravity=made.gravity, latitude=made.latitude)
+    assert got.names == ("01", "02", "03")
+    assert got.healthy
+
+
 def test_dead_axes_come_first_and_the_rest_is_still_judged() -> None:
     call = later(100)
     logs = list(call["logs"])
