@@ -29,7 +29,17 @@ from typing import Any
 
 import numpy as np
 
-from railnav.estimation import Chain, ChainFilter, constant_velocity_chain, increment_chain, inverse_root, solve_chain
+from railnav.estimation import (
+    Chain,
+    ChainFilter,
+    CorrelatedError,
+    IncrementDrift,
+    constant_velocity_chain,
+    increment_chain,
+    inverse_root,
+    solve_chain,
+    survey_chain,
+)
 from railnav.estimation.oracle import banded_solution
 
 #: Shape of the covariances where one serves for all epochs.
@@ -183,6 +193,71 @@ def one_epoch() -> dict[str, float]:
     }
 
 
+def wide_states(count: int) -> list[dict[str, float]]:
+    """Survey menus n = 6 (drifting increments) and n = 9 (and correlated fixes): microseconds an epoch, forward and smoothing."""
+    rng = np.random.default_rng(10)
+    N = 100_000
+    X, dX = 0.02 * rng.standard_normal((N, 3)), 1e-3 * rng.standard_normal((N - 1, 3))
+    drift = IncrementDrift(np.eye(3), [1e-3] * 3, [1e-5] * 3)
+    out = []
+    for error in (None, CorrelatedError(0.01, 300.0, 1.0)):
+        chain = survey_chain(X, 4e-4 * COVARIANCE, dX, 1e-6 * COVARIANCE, drift=drift, correlated=error)
+        solve_chain(chain, covariance=False)
+        bare = statistics.median(cpu(lambda c=chain: solve_chain(c, covariance=False)) for _ in range(count))
+        full = statistics.median(cpu(lambda c=chain: solve_chain(c)) for _ in range(count))
+        out.append(
+            {"n": chain.n, "us_per_epoch": round(1e6 * bare / N, 2), "with_covariances_us": round(1e6 * full / N, 2)}
+        )
+    return out
+
+
+def against_gtsam(count: int) -> dict[str, Any] | None:
+    """The same n = 3 chain as a batch of Jacobian factors in GTSAM, built and eliminated; None where it is not installed."""
+    try:
+        import gtsam
+    except ImportError:
+        return None
+    epochs = 100_000
+    chain, _ = survey(epochs)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    unit = gtsam.noiseModel.Unit.Create(3)
+
+    def build() -> Any:
+        graph = gtsam.GaussianFactorGraph()
+        for k in range(epochs):
+            graph.add(gtsam.JacobianFactor(k, chain.H[k], chain.z[k], unit))
+        for k in range(epochs - 1):
+            graph.add(gtsam.JacobianFactor(k, chain.M[k], k + 1, chain.L[k], chain.u[k], unit))
+        return graph
+
+    ordering = gtsam.Ordering()
+    for k in range(epochs):
+        ordering.push_back(k)
+    building = [cpu(build) for _ in range(3)]
+    graph = build()
+    solving = [cpu(lambda: graph.optimize(ordering)) for _ in range(3)]
+    answer = graph.optimize(ordering)
+    after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    state = solve_chain(chain, covariance=False).state
+    gap = max(float(np.abs(answer.at(k) - state[k]).max()) for k in range(0, epochs, 997))
+    ours = statistics.median(cpu(lambda: solve_chain(chain, covariance=False)) for _ in range(count))
+    tracemalloc.start()
+    solve_chain(chain, covariance=False)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    built, solved = statistics.median(building), statistics.median(solving)
+    return {
+        "gtsam_build_ms": round(1e3 * built, 1),
+        "gtsam_solve_ms": round(1e3 * solved, 1),
+        "gtsam_memory_MB": round((after - before) / 1e3),
+        "chain_ms": round(1e3 * ours, 2),
+        "chain_memory_MB": round(peak / 1e6, 1),
+        "ratio_solve": round(solved / ours, 1),
+        "ratio_whole": round((built + solved) / ours, 1),
+        "largest_difference_m": gap,
+    }
+
+
 def available_gb() -> float:
     """Memory that is free, GB, where the system says."""
     try:
@@ -203,6 +278,7 @@ def main() -> None:
         "command": "python benchmarks/chain.py --json PATH",
         "machine": f"{platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}, one core",
     }
+    figures["gtsam"] = against_gtsam(5)  # first: its memory is what the process grows by
     figures["banded_n3"] = against_banded(options.pairs)
     for every in (1, 10):
         row = figures["banded_n3"][f"fix_every_{every}"]
@@ -231,6 +307,20 @@ def main() -> None:
         )
     figures["live_epoch_n3"] = row = one_epoch()
     print(f"\none live epoch through Python: median {row['median_us']} us, p99 {row['p99_us']} us (CPU)")
+    figures["wide_states"] = wide_states(5)
+    for row in figures["wide_states"]:
+        print(f"survey menu n = {row['n']}: {row['us_per_epoch']:.2f} us an epoch, with all covariances "
+              f"{row['with_covariances_us']:.2f} us (bars 1.5 and 3.5)")  # fmt: skip
+    row = figures["gtsam"]
+    if row is None:
+        print("gtsam is not installed here: no comparison (pip install gtsam, Python 3.11)")
+    else:
+        print(
+            f"gtsam, 100,000 epochs, n = 3: build {row['gtsam_build_ms']:.0f} ms, solve {row['gtsam_solve_ms']:.0f} ms, "
+            f"{row['gtsam_memory_MB']} MB; chain {row['chain_ms']:.1f} ms, {row['chain_memory_MB']} MB: "
+            f"{row['ratio_solve']:.0f} times faster than its solving, {row['ratio_whole']:.0f} than with its building; "
+            f"difference {row['largest_difference_m']:.1e} m"
+        )
     if options.json:
         options.json.write_text(json.dumps(figures, indent=1) + "\n")
     worst = max(figures["banded_n3"][f"fix_every_{every}"]["largest_difference_m"] for every in (1, 10))

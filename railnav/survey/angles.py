@@ -39,6 +39,8 @@ FLOOR = 2e-5
 LEAST_WALK = 2e-6
 #: A slope this many white sigma off the running median of so many nodes, and at least so far, rad, is a gross error.
 SLIP_RATIO, SLIP_NODES, LEAST_SLIP = 10.0, 31, 2e-3
+#: The same where no third run is there to decide, rad.
+LONE_SLIP = 0.03
 #: More good fixes than this between two of a track: the run was elsewhere meanwhile.
 MOST_OTHERS = 5
 #: A gap in the angles longer than this is not interpolated, s.
@@ -209,17 +211,26 @@ def slopes_of(
 
 
 def _without_slips(value: FloatArray, slope: FloatArray, error: AngleError) -> FloatArray:
-    """Slopes without those that stand alone against the axis and against their own neighbours: gross errors of a link."""
+    """Slopes without gross errors: those that stand alone against the axis, their own neighbours, and the other runs there.
+
+    With three runs or more the middle one is the witness; with fewer only what no track does counts, for the axis may be wrong.
+    """
     from scipy.ndimage import median_filter
 
     out = value.copy()
-    for row in out:
+    rest = value - slope
+    apart = np.zeros_like(value)
+    for k, row in enumerate(rest):
         at = np.flatnonzero(np.isfinite(row))
-        if len(at) < SLIP_NODES:
-            continue
-        rest = row[at] - slope[at]
-        apart = np.abs(rest - median_filter(rest, SLIP_NODES, mode="nearest"))
-        row[at[apart > max(SLIP_RATIO * error.white, LEAST_SLIP)]] = np.nan
+        if len(at) >= SLIP_NODES:
+            apart[k, at] = row[at] - median_filter(row[at], SLIP_NODES, mode="nearest")
+    known = np.isfinite(value)
+    many = known.sum(axis=0)
+    middle = np.zeros(value.shape[1])
+    if (many >= 3).any():
+        middle[many >= 3] = np.nanmedian(np.where(known, apart, np.nan)[:, many >= 3], axis=0)
+    limit = np.where(many >= 3, max(SLIP_RATIO * error.white, LEAST_SLIP), LONE_SLIP)
+    out[known & (np.abs(apart - middle) > limit)] = np.nan
     return out
 
 
