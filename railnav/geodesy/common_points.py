@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from railnav.errors import CrsError
 from railnav.geodesy.ellipsoid import WGS84, Ellipsoid
 from railnav.geodesy.grid import choose_frame
-from railnav.geodesy.helmert import ARC_SECOND, Helmert
+from railnav.geodesy.helmert import ARC_SECOND, LARGEST_ANGLE, Helmert
 from railnav.geodesy.plane import GridFrame
 
 FloatArray = NDArray[np.float64]
@@ -287,6 +287,12 @@ class _Space:
     def helmert(self, solution: FloatArray) -> Helmert:
         scale = float(solution[6]) * 1e-6 if self.full else 0.0
         angles = solution[3:6] * 1e-6 / (1.0 + scale) if self.full else np.zeros(3)
+        widest = float(np.max(np.abs(angles)))
+        if widest > LARGEST_ANGLE:
+            raise CrsError(
+                f"a rotation of {widest / ARC_SECOND:.0f} arc seconds comes out, which joins no two datums: the points lie too nearly on a "
+                "line to tell it, or are not in this plane; use 4 or 3 parameters, or look at units and axes"
+            )
         turned = Helmert((0.0, 0.0, 0.0, *map(float, angles), scale))
         shift = solution[:3] + self.centre - turned.apply(self.centre)
         return Helmert((*map(float, shift), *map(float, angles), scale))
@@ -319,7 +325,11 @@ class _Space:
         angles = (rx / ARC_SECOND, ry / ARC_SECOND, rz / ARC_SECOND)  # backwards and position vector: signs as they are
         seven = (*back.tolist(), *angles, turned.parameters[6] * 1e6)
         base = self.system.geodetic_crs
-        bound = BoundCRS(self.system, CRS.from_epsg(4326), ToWGS84Transformation(base, *seven))
+        plain = self.system
+        if plain.name in ("unknown", "unnamed"):  # a PROJ string has no name of its own
+            text = str(plain.to_wkt("WKT2_2019"))
+            plain = CRS.from_wkt(text.replace(f'"{plain.name}"', f'"{name.replace(chr(34), "")}"', 1))
+        bound = BoundCRS(plain, CRS.from_epsg(4326), ToWGS84Transformation(base, *seven))
         return GridFrame(" ".join(str(bound.to_wkt("WKT2_2019")).split()), name, pipeline, words, accuracy)
 
 

@@ -55,6 +55,7 @@ def test_the_written_system_is_the_pipeline_for_other_programs():
         ours = fit.frame.to_grid(latitude, longitude, height)
         np.testing.assert_allclose(np.column_stack(there)[:, :2], np.column_stack(ours)[:, :2], atol=near)
         assert '"' not in fit.frame.name
+        assert system.name == fit.frame.name  # what QGIS shows
 
 
 def test_four_parameters_in_the_plane():
@@ -207,6 +208,8 @@ def test_refusals():
     flat = np.column_stack(on.to_grid(line, np.full(5, 0.6), np.full(5, 100.0)))
     straight = fit_datum(line, np.full(5, 0.6), np.full(5, 100.0), *flat.T, crs=LOCAL, parameters=3)
     assert any("extrapolates" in line for line in straight.advice)
+    with pytest.raises(CrsError, match="joins no two datums"):  # easting and northing exchanged
+        fit_datum(latitude, longitude, height, grid[:, 1] + 2e6, grid[:, 0], grid[:, 2], crs=LOCAL)
     grid2 = grid.copy()
     grid2[2, 0] = np.nan
     with pytest.raises(CrsError, match="point 3: its easting is not finite"):
