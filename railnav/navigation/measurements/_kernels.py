@@ -544,7 +544,8 @@ def speed_rows(fil, bank, work, h, row):
         h_row[i_a] = 0.0
     if course_east == course_east and speed > 1.0 and abs(x[i_v]) > 1.0:
         bend = point[P_CURVATURE]
-        step = x[i_s] - point[POINT_SIZE]
+        i_t = at[TIME_TAG]
+        step = x[i_s] + x[i_v] * x[i_t] - point[POINT_SIZE]  # the course is of where the fix shows the train
         te = point[P_D_EAST] + step * bend * point[P_D_NORTH]
         tn = point[P_D_NORTH] - step * bend * point[P_D_EAST]
         across = sign * speed * (course_east * tn - course_north * te) / math.hypot(te, tn)
@@ -552,12 +553,14 @@ def speed_rows(fil, bank, work, h, row):
         floor = speed * k[K_COURSE_SIGMA] * (0.2 if stated else 3.0)
         bent = 0.5 * speed * BEND_CHANGE * variance_of(P_sqrt, i_s)
         h_row[i_s] = sign * speed * bend
+        h_row[i_t] = h_row[i_s] * x[i_v]
         variance = sigma * sigma + floor * floor + bent * bent
         # tracks side by side differ in bearing by less than a model is wrong: only a turnout's leg is evidence
         doubt = k[K_COURSE_DOUBT] + point[P_SIGMA_CROSS] / BLIND_LENGTH
         doubt = project(P_sqrt, h_row, f) + variance + (speed * doubt) ** 2
         credit(bank, h, BY_COURSE, -0.5 * (min(across * across / doubt, ROW_GATE) + math.log(doubt)))
         robust_row(x, P_sqrt, h_row, across, variance, f, keep, move)
+        h_row[i_t] = 0.0
         h_row[i_s] = 0.0
 
 
