@@ -80,7 +80,10 @@ def whittaker(values: ArrayLike, step: float, cutoff: float, *, weight: ArrayLik
         raise TrackError(f"{n} values are too few to smooth")
     if not cutoff > 2.0 * step:
         raise TrackError(f"a cut-off of {cutoff} m is too short for a step of {step} m")
-    w = np.where(np.isfinite(y), 1.0 if weight is None else np.asarray(weight, float), 0.0)
+    known = np.isfinite(y)
+    if known.sum() < 4:
+        raise TrackError(f"{int(known.sum())} of {n} values are known: too few to smooth between")
+    w = np.where(known, 1.0 if weight is None else np.asarray(weight, float), 0.0)
     strength = (cutoff / (2.0 * math.pi * step)) ** 6
     stencil = np.array([-1.0, 3.0, -3.0, 1.0])
     band = np.zeros((4, n))
@@ -88,8 +91,15 @@ def whittaker(values: ArrayLike, step: float, cutoff: float, *, weight: ArrayLik
         for j in range(i, 4):
             band[3 - (j - i), j : n - 3 + j] += strength * stencil[i] * stencil[j]
     band[3] += w
+    # solved for the change, not for the values: coordinates of hundreds of kilometres would drown it in rounding
+    index = np.arange(n, dtype=float)
+    first = np.where(known, y, np.interp(index, index[known], y[known]))
+    third = first[3:] - 3.0 * first[2:-1] + 3.0 * first[1:-2] - first[:-3]
+    pull = np.zeros(n)
+    for i in range(4):
+        pull[i : n - 3 + i] -= strength * stencil[i] * third
     try:
-        return np.asarray(solveh_banded(band, w * np.where(w > 0.0, np.nan_to_num(y), 0.0)))
+        return np.asarray(first + solveh_banded(band, pull))
     except LinAlgError as error:
         raise TrackError("too few values are known to smooth between") from error
 
