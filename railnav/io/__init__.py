@@ -7,9 +7,12 @@ column.
 Modules
 -------
 atomic : a save leaves the old file or the new one, whole.
-tables : CSV and Parquet columns, with refusals.
-run, truth, solution : what a train recorded, where it was, where railnav says it was.
-container : a GeoPackage as a container of layers and tables.
-geopackage : the store of a reference track model.
-geojson, elements : track networks to import, and back.
+tables, xml_document : CSV and Parquet columns, XML without entities, with refusals.
+run, run_check, truth, solution : what a train recorded and every defect of it, where it was, where railnav says it was.
+gnss_log, nmea, rtklib, ubx, ubx_sensors, gpx, gpsd, bags, tcp_log : receivers' logs, recordings and streams.
+logs, log_writers : logs that stand alone, and one made of another, piece by piece.
+container, geopackage, qgis_styles : a GeoPackage as layers and tables, the store of a reference track model, how QGIS draws it.
+network : a track network from any file; osm, geojson, elements, axis_table, landxml, railml, railml2, layers : from each kind.
+design, designed, designs, junctions, drawn : designed alignments laid out as knots, found again in knots; ends joined; drawn lines rounded.
+landxml_writer, railml_writer, elements_writer, kml, moving_features : models, designs and solutions for other programs.
 """

@@ -119,6 +119,42 @@ def test_logs_become_other_logs(here: Path) -> None:
     assert run("info", "copy")["kind"] == "run"
 
 
+def test_what_an_address_sends(here: Path) -> None:
+    import socket
+    import threading
+
+    run("convert", "service", "-o", "a.nmea")
+    server = socket.create_server(("127.0.0.1", 0))
+
+    def serve() -> None:
+        link, _ = server.accept()
+        with link:
+            link.sendall(Path("a.nmea").read_bytes())
+
+    threading.Thread(target=serve, daemon=True).start()
+    facts = run("convert", f"tcp://127.0.0.1:{server.getsockname()[1]}", "-o", "heard.gpx")
+    server.close()
+    assert facts["fixes"] == len(read_run("service").gnss)
+    done = CliRunner().invoke(main, ["convert", "a.nmea", "-o", "b.gpx", "--seconds", "5"])
+    assert done.exit_code == 2
+
+
+def test_a_log_is_described_and_judged(here: Path) -> None:
+    run("convert", "service", "-o", "a.nmea")
+    text = bytearray(Path("a.nmea").read_bytes())
+    text[200] ^= 1
+    Path("a.nmea").write_bytes(bytes(text))
+    facts = run("info", "a.nmea")
+    assert facts["logs"][0]["broken"] == 1
+    done = CliRunner().invoke(main, ["info", "a.nmea"])
+    assert "1, the first at" in done.stdout
+    done = CliRunner().invoke(main, ["validate", "a.nmea"])
+    assert done.exit_code == 0
+    assert "remark: log" in done.stdout
+    Path("b.nmea").write_text("no log at all")
+    assert CliRunner().invoke(main, ["validate", "b.nmea"]).exit_code == 1
+
+
 def test_styles_for_qgis(here: Path) -> None:
     import sqlite3
 

@@ -16,7 +16,13 @@ def run(name: str) -> Any:
 
 
 def test_every_example_is_tested():
-    assert {p.stem for p in FOLDER.glob("*.py")} == {"own_track", "simulate_and_judge", "build_and_navigate", "calibrate_imu"}
+    assert {p.stem for p in FOLDER.glob("*.py")} == {
+        "own_track",
+        "simulate_and_judge",
+        "build_and_navigate",
+        "calibrate_imu",
+        "other_programs",
+    }
 
 
 def test_own_track(capsys):
@@ -55,3 +61,11 @@ def test_calibrate_imu(capsys):
     assert "a year later: accelerometer scale y moved by +3.1" in said
     assert unit.accelerometer.positions == 18
     assert not health.healthy
+
+
+def test_other_programs(capsys):
+    worst, fixes = run("other_programs")
+    said = capsys.readouterr().out
+    assert said.count("back within") == 2
+    assert max(worst.values()) < 1e-3
+    assert fixes > 20

@@ -393,10 +393,9 @@ def test_broken_frames_are_left_out(tmp_path):
 
 # --- ROS --------------------------------------------------------------------------------------------------------------
 
-rosbags = pytest.importorskip("rosbags.highlevel")
-
 
 def write_bag(path, *, two=False, stamped=True):
+    pytest.importorskip("rosbags")
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
