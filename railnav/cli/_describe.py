@@ -65,6 +65,7 @@ def describe_model(model: TrackModel) -> dict[str, Any]:
         "nodes": kinds,
         "movements": len(model.movements),
         "mileposts": len(model.mileposts.track),
+        "lines": [line.line for line in model.references.lines],
         "crs": model.frame.name,
         "operation": model.frame.operation,
         "pipeline": model.frame.pipeline,
@@ -110,6 +111,7 @@ def print_model(facts: dict[str, Any], title: str) -> None:
             "nodes": ", ".join(words.count(n, *_NODES.get(kind, (kind, ""))) for kind, n in kinds.items()),
             "movements": f"{facts['movements']} permitted",
             "mileposts": facts["mileposts"] or "",
+            "line references": ", ".join(line or "(without a name)" for line in facts["lines"]),
             "plane": facts["crs"],
             "transformation": f"{facts['operation']} ({words.accuracy(facts['operation_accuracy_m'])})",
             "made by": _maker(provenance),
@@ -182,6 +184,10 @@ def describe_run(run: Run) -> dict[str, Any]:
     if run.gnss is not None:
         facts["receiver"] = run.gnss.receiver
         facts["frame"] = run.gnss.frame
+        if run.gnss.epoch is not None:
+            facts["epoch"] = run.gnss.epoch
+        if run.gnss.fixed_to:
+            facts["fixed_to"] = run.gnss.fixed_to
         facts["extent_deg"] = {
             "latitude": [float(np.degrees(run.gnss.latitude.min())), float(np.degrees(run.gnss.latitude.max()))],
             "longitude": [float(np.degrees(run.gnss.longitude.min())), float(np.degrees(run.gnss.longitude.max()))],
@@ -200,7 +206,9 @@ def print_run(facts: dict[str, Any], title: str) -> None:
             "direction": facts["direction"],
             "duration": words.duration(facts["duration_s"]),
             "receiver": facts.get("receiver", ""),
-            "frame": facts.get("frame", ""),
+            "frame": facts.get("frame", "")
+            + (f" at {facts['epoch']:.2f}" if "epoch" in facts else "")
+            + (f", carried to {facts['fixed_to']}" if "fixed_to" in facts else ""),
             "extent": f"latitude {extent['latitude'][0]:.5f} to {extent['latitude'][1]:.5f}, "
             f"longitude {extent['longitude'][0]:.5f} to {extent['longitude'][1]:.5f} deg"
             if extent
@@ -309,6 +317,7 @@ def _findings(told: dict[str, Any]) -> dict[str, str]:
     if offset:
         sigma = told.get("frame_offset_sigma_m", 0.0)
         found["frame offset"] = f"{offset[0]:+.1f} m east, {offset[1]:+.1f} m north (prior sigma {sigma:.1f} m)"
+    found |= _found_of_imu(told)
     names = {
         "fixes_suspect": "suspect fixes",
         "gnss_steps": "GNSS steps",
@@ -319,6 +328,23 @@ def _findings(told: dict[str, Any]) -> dict[str, str]:
     events = [f"{told[key]:,} {name}" for key, name in names.items() if told.get(key)]
     if events:
         found["events"] = ", ".join(events)
+    return found
+
+
+def _found_of_imu(told: dict[str, Any]) -> dict[str, str]:
+    """What an inertial scheme estimated beside the way."""
+    found: dict[str, str] = {}
+    roll, pitch = told.get("levelled_roll_deg", 0.0), told.get("levelled_pitch_deg", 0.0)
+    if max(abs(roll), abs(pitch)) > 0.01:
+        found["levelled"] = f"roll {roll:+.1f}, pitch {pitch:+.1f} deg: as mounted the vehicle would not stand level"
+    for key, name, factor, unit, parts in (
+        ("time_offset_s", "time offset", 1e3, "ms, IMU against GNSS", ("",)),
+        ("mounting_pitch_yaw_deg", "mounting", 1.0, "deg left over", ("pitch ", "yaw ")),
+        ("odometer_scale", "odometer scale", 100.0, "%", ("",)),
+    ):
+        if isinstance(told.get(key), dict):
+            pairs = zip(parts, told[key]["value"], told[key]["sigma"], strict=True)
+            found[name] = ", ".join(f"{p}{factor * v:+.2f} +- {factor * s:.2f}" for p, v, s in pairs) + f" {unit}"
     return found
 
 

@@ -141,7 +141,7 @@ def integrate(
     A measurement between two samples is compared at the later one, carried there by velocity and acceleration: a time offset beyond some
     20 ms leaves errors of the turn within it; run again with the stamps moved by the first answer. GNSS errors are taken as
     white; multiply their variances where they are not. Open loop holds for a good IMU and a short time: errors must stay small enough to be
-    linear. With 15 states some 400, with 21 some 200 thousand samples/s a core; the smoother keeps some 25 kB a node with 24 states.
+    linear. With 15 states some 330, with 21 some 180 thousand samples/s a core; the smoother keeps some 18 kB a node with 24 states.
 
     References
     ----------
