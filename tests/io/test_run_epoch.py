@@ -39,6 +39,15 @@ def test_the_start_is_the_epoch_unless_one_is_given(tmp_path):
     assert (given.gnss.epoch, given.gnss.fixed_to, plain.gnss.epoch) == (2026.5, "ETRS89", None)
 
 
+def test_info_says_so(tmp_path):
+    from click.testing import CliRunner
+
+    from railnav.cli import main
+
+    folder = write(tmp_path / "a", 'frame = "ITRF2020"\nepoch = 2026.25\nfixed_to = "ETRS89"')
+    assert "ITRF2020 at 2026.25, carried to ETRS89" in CliRunner().invoke(main, ["info", str(folder)]).output
+
+
 def test_two_years_of_one_place_agree(tmp_path):
     x = np.stack(WGS84.to_cartesian(*BERLIN, 80.0))
     later = np.array(WGS84.to_geodetic(*plate_motion("EURA", 10.0).apply(x)))
