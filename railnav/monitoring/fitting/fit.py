@@ -43,6 +43,8 @@ _TELLING = 3.0
 _FAILED = 5.0
 #: An element this short is nothing, m.
 _STUB = 0.1
+#: Points that lie closer to the axis than their noise count as if they lay this share of its square off.
+_EXACT = 0.25
 #: Rounds of leaving out elements.
 _ROUNDS = 5
 _LAWS = (elements.BLOSS, elements.COSINE, elements.SINE, elements.HELMERT, elements.CUBIC)
@@ -186,14 +188,7 @@ def fit_design(
     fit = fit if smoother is fit else _simplified(smoother, east, north, per_point, noise)
     tell(label, 2, total)
     fit, margin, second = _with_laws(fit, east, north, per_point, noise, laws)
-    for _ in range(3):  # an element bends to one side
-        items = judgement.items_of(fit.chain)
-        if not any(a.k0 * a.k1 < 0.0 for a in items):
-            break
-        parted = judgement.chain_of(judgement.split_inflections(items))
-        again = fit_plan(parted, fit.along, east, north, per_point)
-        fit = again if again.cost < 1.2 * fit.cost else fit_plan(parted, fit.along, east, north, per_point, steps=0)
-    fit = _without_stubs(fit, east, north, per_point)
+    fit = _one_sided(_without_stubs(fit, east, north, per_point), east, north, per_point)
     tell(label, 3, total)
     if not fit.settled:
         warnings.append(f"track {axis.track}: the elements did not come to rest; their sigmas may be too small")
@@ -204,12 +199,16 @@ def fit_design(
             f"track {axis.track}: no elements were found that pass the points within {_FAILED:.0f} times their noise of "
             f"{expected:.3f} m; state their noise (--sigma), or fit a shorter piece"
         )
-    length_sigma, bend_sigma, station_sigma = _plan_sigmas(fit, noise)
     if rounded:
+        length_sigma, bend_sigma, _ = _plan_sigmas(fit, noise)
         with np.errstate(divide="ignore"):
             of_radius = bend_sigma / np.where(fit.chain.kind == elements.ARC, fit.chain.k0, np.nan) ** 2
         fit, count = round_design(fit, east, north, of_radius, length_sigma, scale=axis.scale if on_ground else 1.0)
-        warnings.append(f"track {axis.track}: {count} radii and lengths rounded; sigmas are those before")
+        fit = _one_sided(fit, east, north, per_point)
+        warnings.append(
+            f"track {axis.track}: {count} radii and lengths rounded and held: they have no sigma of their own"
+        )
+    length_sigma, bend_sigma, station_sigma = _plan_sigmas(fit, noise)
     plan = fit.chain.plan
     k = np.where(plan.kind == elements.ARC, plan.curvature_start, np.nan)
     radius_sigma = bend_sigma / k**2
@@ -271,7 +270,7 @@ def _segment(
     window = float(np.clip((720.0 * chosen.spacing * white**2 / 1e-6) ** 0.2, 6.5 * chosen.spacing, 120.0))
     ref = segmentation.reference(along, east, north, window)
     wide = max(round(20.0 / chosen.spacing), 3)
-    smooth = np.convolve(ref[3], np.ones(wide) / wide, mode="same")
+    smooth = _averaged(ref[3], wide)
     bend = float(np.clip(np.percentile(np.abs(smooth), 90), 2e-4, 0.05))
     rate = float(np.clip(bend / 20.0, 5e-6, 5e-3))
 
@@ -299,6 +298,20 @@ def _simplified(fit: PlanFit, east: FloatArray, north: FloatArray, sigma: FloatA
             break
         fit = fewer
     return _without_stubs(fit, east, north, sigma)
+
+
+def _one_sided(fit: PlanFit, east: FloatArray, north: FloatArray, sigma: FloatArray) -> PlanFit:
+    """The fit with every transition bending to one side: cut where it is straight, and adjusted again where that helps."""
+    for last in (False, False, True):
+        items = judgement.items_of(fit.chain)
+        if not any(item.k0 * item.k1 < 0.0 for item in items):
+            break
+        # no other law can be cut in two of its kind
+        both = [replace(item, kind=CLOTHOID) if item.k0 * item.k1 < 0.0 else item for item in items]
+        parted = judgement.chain_of(judgement.split_inflections(both))
+        again = fit_plan(parted, fit.along, east, north, sigma, steps=0 if last else 40)
+        fit = again if last or again.cost < 1.2 * fit.cost else fit_plan(parted, fit.along, east, north, sigma, steps=0)
+    return fit
 
 
 def _without_stubs(fit: PlanFit, east: FloatArray, north: FloatArray, sigma: FloatArray) -> PlanFit:
@@ -450,7 +463,7 @@ def _spread(fit: PlanFit, noise: Noise) -> float:
     again = 1.0 + 2.0 * noise.length / step * noise.correlated**2 / (white**2 + noise.correlated**2)
     unknown = 2 * len(fit.chain.kind) + 3
     size = fit.cost / max(len(fit.along) - unknown, 1)
-    return max(again * size, 1e-12)
+    return again * max(size, _EXACT)  # exact points do not tell more than their rounding
 
 
 def _as_found(fit: PlanFit, noise: Noise, sigma: float | None) -> Noise:
@@ -494,6 +507,12 @@ def _plan_sigmas(fit: PlanFit, noise: Noise) -> tuple[FloatArray, FloatArray, Fl
 # --- profile and cant -------------------------------------------------------------------------------------------------
 
 
+def _averaged(values: FloatArray, count: int) -> FloatArray:
+    """Running mean of `count` values, of all where there are fewer."""
+    count = min(count, len(values))
+    return np.convolve(values, np.ones(count) / count, mode="same")
+
+
 def _feet_of_all(axis: Axis, rows: IntArray, fit: PlanFit) -> FloatArray:
     """Lengths of all points along the fitted axis, also of those that were passed over; strictly growing, m."""
     along = np.interp(axis.along, axis.along[rows], fit.along)
@@ -528,7 +547,7 @@ def _profile(
     place = axis.along[pick]
     slope = np.gradient(height, place)
     wide = max(3, round(50.0 / chosen.spacing))
-    smooth = np.convolve(slope, np.ones(wide) / wide, mode="same")
+    smooth = _averaged(slope, wide)
     bend = float(np.clip(np.percentile(np.abs(np.gradient(smooth, place)), 90), 2e-5, 2e-3))
 
     def pieces(noise: Noise, part: slice, beam: int = segmentation.NARROW) -> Pieces:

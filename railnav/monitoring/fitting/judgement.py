@@ -20,6 +20,8 @@ IntArray = NDArray[np.int64]
 
 #: A value within this many sigmas of nothing is nothing.
 NOTHING = 3.0
+#: A transition that bends the other way over less than this share of it does not.
+_HARDLY = 0.03
 #: A transition is none within this many sigmas of its length.
 _NO_LENGTH = 2.0
 
@@ -97,17 +99,29 @@ def split_inflections(items: list[Item]) -> list[Item]:
     from railnav.track.elements import Plan, integrate
 
     out: list[Item] = []
-    for item in items:
+    rest = list(items)
+    for j in range(len(rest)):
+        item = rest[j]
         if item.kind < elements.CLOTHOID or not item.k0 * item.k1 < 0.0:
             out.append(item)
             continue
         share = item.k0 / (item.k0 - item.k1)
         before, after = share * item.length, (1.0 - share) * item.length
         last = out[-1] if out else None
-        if before < 0.5 and (not item.smooth or (last is not None and last.kind >= elements.CLOTHOID)):
-            if item.smooth and last is not None:
+        following = rest[j + 1] if j + 1 < len(rest) else None
+        hardly = max(0.5, _HARDLY * item.length)
+        if before < hardly and (last is None or last.kind != elements.ARC or not item.smooth):
+            if last is not None and last.kind >= elements.CLOTHOID and item.smooth:
                 out[-1] = replace(last, k1=0.0)
-            out.append(replace(item, k0=0.0))
+            straight = last is not None and last.kind == elements.STRAIGHT
+            out.append(replace(item, k0=0.0, smooth=item.smooth or straight))
+            continue
+        if after < hardly and (following is None or following.kind != elements.ARC or not following.smooth):
+            out.append(replace(item, k1=0.0))
+            if following is not None and following.kind >= elements.CLOTHOID and following.smooth:
+                rest[j + 1] = replace(following, k0=0.0)
+            elif following is not None and following.kind == elements.STRAIGHT:
+                rest[j + 1] = replace(following, smooth=True)
             continue
         one = np.array([0.0])
         plan = Plan(
