@@ -206,6 +206,8 @@ def read_log(path: str | Path, format: str, *, start: datetime) -> GnssLog:  # n
     return log
 
 
+#: What a reader notes where the log never says which day it is.
+NO_DATE = "no sentence states the date"
 #: Takes what a reader has collected so far; it begins again after that.
 Sink = Callable[["Found"], None]
 
@@ -259,8 +261,6 @@ def stream_log(
         found = scan(path, origin, sink=relay, part=part)
     except OSError as error:
         raise RunError(f"cannot be read ({error.strerror or error})", file=path) from error
-    if start is None and any("no sentence states the date" in note for note in found.notes):
-        raise RunError("no sentence states the date", file=path, remedy="say when the log starts, with --start")
     relay(found)
     _check_broken(found)
     if not relay.fixes:
@@ -286,6 +286,8 @@ class _Relay:
         stamp = found.stamp
         if not len(stamp):
             return
+        if self.start is None and any(NO_DATE in note for note in found.notes):
+            raise RunError(NO_DATE, file=found.file, remedy="say when the log starts, with --start")
         if self.shift is None:
             self.shift = gnss_time.roll_overs(int(stamp[0]), self.start) if self.start is not None else 0
             if self.shift:

@@ -34,6 +34,8 @@ ENDINGS = {
 #: And those that say nothing: the first bytes tell.
 _TOLD = (".log", ".txt", ".jsonl", ".dat", ".raw", "")
 _HEAD = 1 << 16
+#: A log is written to its file within this of its first fix, as a rule, ns.
+_NEAR_WRITTEN = 10 * gnss_time.DAY
 
 
 def log_format(path: str | Path) -> str | None:
@@ -125,7 +127,7 @@ def read_bare_log(
         gnss=_gnss(log.table, log.table.increasing("time_s"), _Gnss(path.name), begin, path),
         source=path,
     )
-    notes = log.summary.notes
+    notes = (*log.summary.notes, *(_displaced(path, begin) if start is None else ()))
     if kind == "ubx" and any(name in log.summary.counts for name in ("ESF-RAW", "ESF-MEAS")):
         from railnav.io.ubx_sensors import read_sensors
 
@@ -157,12 +159,25 @@ def first_instant(path: str | Path, format: str) -> datetime:  # noqa: A002
         raise _Enough
 
     with suppress(_Enough):
-        stream_log(path, format, take, part=64)
+        stream_log(path, format, take, part=1 << 14)
     second = first[0] // gnss_time.SECOND
     try:
         return datetime.fromtimestamp(second, UTC)
     except (OverflowError, OSError, ValueError) as error:
         raise RunError(f"its first fix is of {second} s since 1970", file=path, remedy="say --start") from error
+
+
+def _displaced(path: Path, begin: datetime) -> tuple[str, ...]:
+    """A doubt, where the log's dates lie whole roll-overs of GPS weeks before the day on which its file was last written."""
+    written = int(path.stat().st_mtime) * gnss_time.SECOND
+    behind = written - gnss_time.nanoseconds(begin)
+    count = round(behind / gnss_time.ROLL_OVER)
+    if count < 1 or abs(behind - count * gnss_time.ROLL_OVER) > _NEAR_WRITTEN:
+        return ()
+    weeks = count * 1024
+    return (
+        f"its dates lie {weeks} weeks before the file was written: a roll-over of GPS weeks? say --start to put it right",
+    )
 
 
 def convert_log(
@@ -253,7 +268,7 @@ def _pieces(
         writer.close()
     if not writer.fixes:
         raise RunError("has no fix that this format can hold", file=source, remedy="write .nmea, .gpx or .csv")
-    said = [*summary.notes, *writer.notes]
+    said = [*summary.notes, *writer.notes, *(_displaced(source, begin) if start is None else ())]
     if summary.broken:
         said.insert(0, f"{summary.broken} broken {summary.unit} left out (the first at {summary.first_broken})")
     return writer.fixes, tuple(said)

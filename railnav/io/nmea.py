@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from railnav.io import _kernels, gnss_time
-from railnav.io.gnss_log import BLOCK, COLUMNS, ByteArray, Found, Gathered, IntArray, Sink, rank, through
+from railnav.io.gnss_log import BLOCK, COLUMNS, NO_DATE, ByteArray, Found, Gathered, IntArray, Sink, rank, through
 
 #: Sentences that are used, in the order of their counters.
 SENTENCES = ("GGA", "GNS", "RMC", "GLL", "GST", "VTG", "ZDA", "other")
@@ -75,7 +75,7 @@ def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> 
             clock[:] = [(int(of_day[-1]), int(day[-1]))]
             now.stamp = day[before:] * gnss_time.DAY + of_day
             if not stated:
-                now.notes.append("no sentence states the date; the day nearest to run.start was taken")
+                now.notes.append(f"{NO_DATE}; the day nearest to run.start was taken")
         return now
 
     def step(data: ByteArray, last: bool) -> int:

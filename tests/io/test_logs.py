@@ -6,6 +6,7 @@ import functools
 import json
 import math
 import operator
+import os
 import socket
 import struct
 import threading
@@ -150,6 +151,8 @@ def test_a_log_without_a_date_needs_its_start(tmp_path):
     (tmp_path / "a.nmea").write_text(text)
     with pytest.raises(RunError, match="no sentence states the date; say when the log starts"):
         read_bare_log(tmp_path / "a.nmea")
+    with pytest.raises(RunError, match="no sentence states the date"):
+        convert_log(tmp_path / "a.nmea", tmp_path / "a.gpx")
     run, notes = read_bare_log(tmp_path / "a.nmea", start=datetime(2026, 5, 4, 17, 28, tzinfo=UTC))
     assert run.gnss.time.tolist() == [14.0]
     assert "states the date" in notes[0]
@@ -166,8 +169,10 @@ def test_a_roll_over_is_put_right_when_the_start_is_known(folder, tmp_path):
         body = line[1:].partition("*")[0]
         lines.append(f"${body}*{functools.reduce(operator.xor, body.encode(), 0):02X}" if body else "")
     (tmp_path / "old.nmea").write_text("\r\n".join(lines), newline="")
-    run, _ = read_bare_log(tmp_path / "old.nmea")
+    os.utime(tmp_path / "old.nmea", (START.timestamp() + 3600,) * 2)
+    run, notes = read_bare_log(tmp_path / "old.nmea")
     assert run.start.date() == old.date()
+    assert "its dates lie 1024 weeks before the file was written" in notes[-1]
     count, notes = convert_log(tmp_path / "old.nmea", tmp_path / "b.gpx", start=START)
     assert count == COUNT
     assert "displaced by a GPS week roll-over and were moved by +1024 weeks" in notes[0]
