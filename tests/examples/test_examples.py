@@ -22,6 +22,7 @@ def test_every_example_is_tested():
         "build_and_navigate",
         "calibrate_imu",
         "other_programs",
+        "through_an_outage",
     }
 
 
@@ -69,3 +70,11 @@ def test_other_programs(capsys):
     assert said.count("back within") == 2
     assert max(worst.values()) < 1e-3
     assert fixes > 20
+
+
+def test_through_an_outage(capsys):
+    worst = run("through_an_outage")
+    assert "loose" in capsys.readouterr().out
+    assert worst["odometer"] < 0.5 * worst["loose"]
+    assert worst["odometer, smoothed"] < worst["loose"]
+    assert worst["track"] < 10.0
