@@ -165,6 +165,15 @@ PAGES = {
                 "The three-lobed road loop: the literal rule does not meet its own figures; the arc-length corrector does.",
                 "python benchmarks/map_corrector.py",
             ),
+            Section(
+                "formats",
+                "Networks of other programs, in and out",
+                "Cologne's railways from OpenStreetMap, 11 alignments of SBB's LandXML, Mannheim's table of tram axes, each against its own "
+                "figures: joints, cant, profile, node coordinates, movements, what validate finds. Then models written in each format, read "
+                "back and compared metre by metre; railML carries no cant.",
+                "python benchmarks/formats.py",
+                real_data=True,
+            ),
         ),
     ),
     "performance.md": (
