@@ -15,34 +15,14 @@ from railnav.simulation.faults import Fault
 #: Faults that the navigator does not master yet; `docs/accuracy.md` says so.
 NOT_YET = {
     "balise-misnamed",
-    "gnss-ramp-left-0.5",
-    "gnss-step-along-100m",
     "gnss-ramp-along-0.1",
     "gnss-ramp-along-0.5",
-    "gnss-ramp-along-2",
-    "gnss-burst-10m",
-    "gnss-burst-50m",
-    "gnss-burst-200m",
-    "gnss-frozen-60s",
-    "gnss-frozen-position",
-    "gnss-replay-60s",
-    "gnss-replay-10s",
+    "gnss-ramp-left-0.5",
     "gnss-late-1s",
     "gnss-late-0.3s",
     "gnss-sigma-third",
     "gnss-frame-9m-south",
-    "gnss-speed-1-too-high",
-    "gnss-course-reversed",
     "odometer-dead",
-    "odometer-scale-5-percent",
-    "gyro-bias-step",
-    "gyro-frozen-30s",
-    "gyro-saturated",
-    "gyro-reversed",
-    "accelerometer-bias-step",
-    "accelerometer-saturated",
-    "accelerometer-noise",
-    "imu-late-0.2s",
 }
 
 ONSET = 130.0
@@ -117,7 +97,6 @@ def test_a_model_in_a_mistaken_frame(line, rides, aside):
         keeps_the_pact(*judged(run, truth, with_shifted_model(line, east=aside, north=0.0)))
 
 
-@pytest.mark.xfail(strict=False, reason="not mastered yet")
 def test_a_track_moved_since_the_survey(line, rides):
     stale = with_stale_track(line, "77R-03", start=3000.0, length=400.0, slew=1.5)
     for run, truth in rides["gnss"].values():
