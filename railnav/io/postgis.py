@@ -12,7 +12,6 @@ import struct
 import tempfile
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -21,9 +20,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from railnav.errors import InputError, ModelError, RailnavError, TrackError
+from railnav.errors import InputError, ModelError, TrackError
 from railnav.geodesy.plane import GridFrame
-from railnav.io.container import create, describe_crs
+from railnav.io.container import create
 from railnav.io.geopackage import (
     BLOB_COLUMNS,
     _check_unique,
@@ -35,6 +34,17 @@ from railnav.io.geopackage import (
     read_records,
 )
 from railnav.io.line_references import kilometre_rows, position_rows, references_of_rows
+from railnav.io.postgis_server import (
+    connected,
+    has_tables,
+    hold_lock,
+    make_tables,
+    phrase,
+    plane_srid,
+    set_limits,
+    show_newest,
+    store_names,
+)
 from railnav.io.store_address import StoreAddress, store_address
 from railnav.track.model import End, MilePosts, NodeKind, Nodes, TrackModel
 
@@ -46,113 +56,12 @@ FloatArray = NDArray[np.float64]
 
 #: Version of the tables below.
 SCHEMA_VERSION = 1
-#: Seconds to wait for the server, for another writer, and for one statement.
-CONNECT_TIMEOUT, LOCK_TIMEOUT, STATEMENT_TIMEOUT = 10, 10, 120
 #: A version with more bytes of knots than this is refused before it is fetched.
 MAX_KNOT_BYTES = 16 * 1024**3
 #: Survey records of more bytes do not fit a field.
 MAX_RECORD_BYTES = 900_000_000
 
 _KNOT_BYTES = {name: 48 if name == "covariance_g" else 8 for name in BLOB_COLUMNS}
-_LOCK_ROOM = 0x7261696C  # "rail": the advisory locks of this program
-
-_TABLES = """
-CREATE TABLE {s}.model (
-  model_id serial PRIMARY KEY,
-  name text NOT NULL UNIQUE
-);
-CREATE TABLE {s}.version (
-  version_id bigserial PRIMARY KEY,
-  model_id integer NOT NULL REFERENCES {s}.model ON DELETE CASCADE,
-  version integer NOT NULL,
-  schema_version integer NOT NULL,
-  created timestamptz NOT NULL DEFAULT now(),
-  created_by text NOT NULL,
-  note text NOT NULL,
-  length_m double precision NOT NULL,
-  srid integer NOT NULL,
-  crs json NOT NULL,
-  provenance json NOT NULL,
-  UNIQUE (model_id, version)
-);
-CREATE TABLE {s}.track (
-  version_id bigint NOT NULL REFERENCES {s}.version ON DELETE CASCADE,
-  ordinal integer NOT NULL,
-  track text NOT NULL,
-  line text NOT NULL,
-  name text NOT NULL,
-  length_m double precision NOT NULL,
-  start_km double precision,
-  end_km double precision,
-  start_node text NOT NULL,
-  end_node text NOT NULL,
-  geom geometry NOT NULL,
-  PRIMARY KEY (version_id, ordinal)
-);
-CREATE TABLE {s}.node (
-  version_id bigint NOT NULL REFERENCES {s}.version ON DELETE CASCADE,
-  ordinal integer NOT NULL,
-  node text NOT NULL,
-  kind text NOT NULL,
-  easting double precision NOT NULL,
-  northing double precision NOT NULL,
-  height double precision,
-  geom geometry NOT NULL,
-  PRIMARY KEY (version_id, ordinal)
-);
-CREATE TABLE {s}.milepost (
-  version_id bigint NOT NULL REFERENCES {s}.version ON DELETE CASCADE,
-  ordinal integer NOT NULL,
-  track text NOT NULL,
-  offset_m double precision NOT NULL,
-  chainage_m double precision NOT NULL,
-  geom geometry,
-  PRIMARY KEY (version_id, ordinal)
-);
-CREATE TABLE {s}.movement (
-  version_id bigint NOT NULL REFERENCES {s}.version ON DELETE CASCADE,
-  ordinal integer NOT NULL,
-  track_a text NOT NULL,
-  end_a text NOT NULL,
-  track_b text NOT NULL,
-  end_b text NOT NULL,
-  PRIMARY KEY (version_id, ordinal)
-);
-CREATE TABLE {s}.kilometre (
-  version_id bigint NOT NULL REFERENCES {s}.version ON DELETE CASCADE,
-  ordinal integer NOT NULL,
-  line text NOT NULL,
-  label bigint NOT NULL,
-  start_m double precision NOT NULL,
-  end_m double precision NOT NULL,
-  counted_m double precision NOT NULL,
-  unit_m double precision NOT NULL,
-  PRIMARY KEY (version_id, ordinal)
-);
-CREATE TABLE {s}.line_position (
-  version_id bigint NOT NULL REFERENCES {s}.version ON DELETE CASCADE,
-  ordinal integer NOT NULL,
-  track text NOT NULL,
-  line text NOT NULL,
-  offset_m double precision NOT NULL,
-  position_m double precision NOT NULL,
-  PRIMARY KEY (version_id, ordinal)
-);
-CREATE TABLE {s}.knots (
-  version_id bigint NOT NULL REFERENCES {s}.version ON DELETE CASCADE,
-  ordinal integer NOT NULL,
-  knots bigint NOT NULL,
-  crc32 bigint NOT NULL,
-  {knots},
-  PRIMARY KEY (version_id, ordinal)
-);
-CREATE TABLE {s}.records (
-  version_id bigint PRIMARY KEY REFERENCES {s}.version ON DELETE CASCADE,
-  container bytea NOT NULL
-);
-CREATE INDEX ON {s}.track USING gist (geom);
-CREATE INDEX ON {s}.node USING gist (geom);
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,14 +118,14 @@ def write_model(model: TrackModel, address: str | Path, *, note: str = "") -> in
     except (TypeError, ValueError) as error:
         raise ModelError(f"the provenance holds more than JSON values ({error})", file=str(where)) from error
     records = _packed_records(model, where)
-    with _connected(where) as connection, connection.transaction():
-        _limit(connection, lock=True)
-        _prepare(connection, where)
-        _lock(connection, where)
-        srid = _srid(connection, model.frame.crs_wkt)
-        names = _names(where)
+    with connected(where) as connection, connection.transaction():
+        set_limits(connection, lock=True)
+        make_tables(connection, where)
+        hold_lock(connection, where)
+        srid = plane_srid(connection, model.frame.crs_wkt)
+        names = store_names(where)
         row = connection.execute(
-            _text(
+            phrase(
                 "INSERT INTO {s}.model (name) VALUES (%s) ON CONFLICT (name) DO UPDATE SET name = excluded.name RETURNING model_id",
                 names,
             ),
@@ -232,7 +141,7 @@ def write_model(model: TrackModel, address: str | Path, *, note: str = "") -> in
             "accuracy_m": frame.accuracy,
         }
         made = connection.execute(
-            _text(
+            phrase(
                 "INSERT INTO {s}.version (model_id, version, schema_version, created_by, note, length_m, srid, crs, provenance) "
                 "SELECT %s, coalesce(max(version), 0) + 1, %s, %s, %s, %s, %s, %s, %s FROM {s}.version WHERE model_id = %s "
                 "RETURNING version_id, version",
@@ -253,8 +162,8 @@ def write_model(model: TrackModel, address: str | Path, *, note: str = "") -> in
         assert made is not None
         _copy_all(connection, names, int(made[0]), model, srid)
         if records is not None:
-            connection.execute(_text("INSERT INTO {s}.records VALUES (%s, %s)", names), (made[0], records))
-        _views(connection, where, int(row[0]), srid)
+            connection.execute(phrase("INSERT INTO {s}.records VALUES (%s, %s)", names), (made[0], records))
+        show_newest(connection, where, int(row[0]), srid)
         return int(made[1])
 
 
@@ -278,14 +187,14 @@ def read_model(address: str | Path) -> TrackModel:
         The store cannot be reached, has no such model or version, is of a newer schema, or its rows do not agree.
     """
     where = store_address(address)
-    names = _names(where)
-    with _connected(where) as connection:
+    names = store_names(where)
+    with connected(where) as connection:
         connection.read_only = True
         from psycopg import IsolationLevel
 
         connection.isolation_level = IsolationLevel.REPEATABLE_READ
         with connection.transaction():
-            _limit(connection)
+            set_limits(connection)
             where, version_id, crs, provenance = _find(connection, where)
             tracks = _rows(connection, names, "track", ("track", "line", "name", "start_node", "end_node"), version_id)
             nodes = _rows(connection, names, "node", ("node", "kind", "easting", "northing", "height"), version_id)
@@ -297,7 +206,7 @@ def read_model(address: str | Path) -> TrackModel:
             places = _rows(connection, names, "line_position", ("track", "line", "offset_m", "position_m"), version_id)
             knot_start, knots = _read_knots(connection, names, version_id, len(tracks), where)
             kept = connection.execute(
-                _text("SELECT 1 FROM {s}.records WHERE version_id = %s", names), (version_id,)
+                phrase("SELECT 1 FROM {s}.records WHERE version_id = %s", names), (version_id,)
             ).fetchone()
     try:
         known = {row[0]: i for i, row in enumerate(tracks)}
@@ -360,166 +269,23 @@ def list_versions(address: str | Path) -> list[StoredVersion]:
         The store cannot be reached.
     """
     where = store_address(address)
-    with _connected(where) as connection:
+    with connected(where) as connection:
         connection.read_only = True
         with connection.transaction():
-            _limit(connection)
-            if not _exists(connection, where):
+            set_limits(connection)
+            if not has_tables(connection, where):
                 return []
             rows = connection.execute(
-                _text(
+                phrase(
                     "SELECT m.name, v.version, v.created, v.created_by, v.note, "
                     "(SELECT count(*) FROM {s}.track t WHERE t.version_id = v.version_id), v.length_m "
                     "FROM {s}.version v JOIN {s}.model m USING (model_id) WHERE %s = '' OR m.name = %s "
                     "ORDER BY m.name, v.version",
-                    _names(where),
+                    store_names(where),
                 ),
                 (where.model, where.model),
             ).fetchall()
     return [StoredVersion(*row) for row in rows]
-
-
-# --- the connection ----------------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def _connected(where: StoreAddress) -> Iterator[psycopg.Connection[Any]]:
-    """A connection whose failures become errors that name the store, without its password."""
-    try:
-        import psycopg
-    except ImportError as error:
-        raise RailnavError('stores need psycopg; install with: pip install "railnav[stores]"') from error
-    try:
-        connection = psycopg.connect(
-            where.dsn, connect_timeout=CONNECT_TIMEOUT, application_name="railnav", autocommit=False
-        )
-    except (psycopg.Error, ValueError, OSError) as error:
-        raise ModelError(f"cannot be reached ({_one_line(error, where)})", file=str(where)) from error
-    try:
-        yield connection
-    except psycopg.errors.LockNotAvailable as error:
-        raise ModelError(
-            f"another writer is saving this model, for more than {LOCK_TIMEOUT} s",
-            file=str(where),
-            remedy="try again later",
-        ) from error
-    except psycopg.errors.QueryCanceled as error:
-        raise ModelError(f"a statement took more than {STATEMENT_TIMEOUT} s", file=str(where)) from error
-    except psycopg.errors.InsufficientPrivilege as error:
-        raise ModelError(
-            f"refuses ({_one_line(error, where)})", file=str(where), remedy="ask for the rights"
-        ) from error
-    except (psycopg.Error, UnicodeError) as error:
-        raise ModelError(f"fails ({_one_line(error, where)})", file=str(where)) from error
-    finally:
-        connection.close()
-
-
-def _one_line(error: BaseException, where: StoreAddress) -> str:
-    from urllib.parse import unquote, urlsplit
-
-    text = " ".join(str(error).split())[:200]
-    password = urlsplit(where.dsn).password
-    for secret in filter(None, (password, unquote(password) if password else None)):
-        text = text.replace(secret, "***")
-    return text
-
-
-def _names(where: StoreAddress) -> dict[str, sql.Composable]:
-    try:
-        from psycopg import sql
-    except ImportError as error:
-        raise RailnavError('stores need psycopg; install with: pip install "railnav[stores]"') from error
-    return {"s": sql.Identifier(where.schema)}
-
-
-def _text(statement: str, names: dict[str, sql.Composable]) -> sql.Composed:
-    """A statement with its identifiers quoted; values are always parameters."""
-    from psycopg import sql
-
-    return sql.SQL(statement).format(**names)  # constants of this module
-
-
-def _limit(connection: psycopg.Connection[Any], *, lock: bool = False) -> None:
-    """Limits that the server keeps, for this transaction."""
-    connection.execute("SELECT set_config('statement_timeout', %s, true)", (str(STATEMENT_TIMEOUT * 1000),))
-    connection.execute("SELECT set_config('idle_in_transaction_session_timeout', %s, true)", ("60000",))
-    if lock:
-        connection.execute("SELECT set_config('lock_timeout', %s, true)", (str(LOCK_TIMEOUT * 1000),))
-
-
-def _exists(connection: psycopg.Connection[Any], where: StoreAddress) -> bool:
-    row = connection.execute(
-        "SELECT 1 FROM information_schema.tables WHERE table_schema = %s AND table_name = 'version'", (where.schema,)
-    ).fetchone()
-    return row is not None
-
-
-def _prepare(connection: psycopg.Connection[Any], where: StoreAddress) -> None:
-    """Make the tables at the first save."""
-    import psycopg
-    from psycopg import sql
-
-    connection.execute("SELECT pg_advisory_xact_lock(%s, 0)", (_LOCK_ROOM,))  # two first saves at once
-    if _exists(connection, where):
-        return
-    try:
-        with connection.transaction():
-            connection.execute("CREATE EXTENSION IF NOT EXISTS postgis")
-    except (
-        psycopg.errors.UndefinedFile,
-        psycopg.errors.FeatureNotSupported,
-        psycopg.errors.InsufficientPrivilege,
-    ) as error:
-        raise ModelError(
-            f"the database has no PostGIS ({_one_line(error, where)})",
-            file=str(where),
-            remedy="CREATE EXTENSION postgis",
-        ) from error
-    names = _names(where)
-    connection.execute(_text("CREATE SCHEMA IF NOT EXISTS {s}", names))
-    columns = sql.SQL(", ").join(sql.SQL("{} bytea NOT NULL").format(sql.Identifier(name)) for name in BLOB_COLUMNS)
-    connection.execute(_text(_TABLES, {**names, "knots": columns}))
-    for table, column in (*(("knots", name) for name in BLOB_COLUMNS), ("records", "container")):
-        connection.execute(  # surveyed digits do not compress: trying costs more than it saves
-            sql.SQL("ALTER TABLE {}.{} ALTER COLUMN {} SET STORAGE EXTERNAL").format(
-                sql.Identifier(where.schema), sql.Identifier(table), sql.Identifier(column)
-            )
-        )
-
-
-def _lock(connection: psycopg.Connection[Any], where: StoreAddress) -> None:
-    """Queue behind other writers of this model; released when the transaction ends."""
-    key = zlib.crc32(f"{where.schema}\0{where.model}".encode()) & 0x7FFFFFFF or 1
-    connection.execute("SELECT pg_advisory_xact_lock(%s, %s)", (_LOCK_ROOM, key))
-
-
-def _srid(connection: psycopg.Connection[Any], crs_wkt: str) -> int:
-    """Number of the plane in the database: its EPSG code, or one of our own; 0 where we may not add one."""
-    import psycopg
-
-    _, code, organization, old, new = describe_crs(crs_wkt)
-    if organization == "EPSG":
-        found = connection.execute("SELECT 1 FROM spatial_ref_sys WHERE srid = %s", (code,)).fetchone()
-        if found:
-            return code
-    text = new if old == "undefined" else old
-    srid = 910_000 + zlib.crc32(text.encode()) % 80_000
-    try:
-        with connection.transaction():
-            for _ in range(100):
-                connection.execute(
-                    "INSERT INTO spatial_ref_sys (srid, auth_name, auth_srid, srtext, proj4text) "
-                    "VALUES (%s, 'railnav', %s, %s, '') ON CONFLICT (srid) DO NOTHING",
-                    (srid, srid, text[:2048]),
-                )
-                row = connection.execute("SELECT srtext FROM spatial_ref_sys WHERE srid = %s", (srid,)).fetchone()
-                if row and row[0] == text[:2048]:
-                    return srid
-                srid += 1
-    except psycopg.errors.InsufficientPrivilege:
-        return 0  # lines and points are there all the same; QGIS asks for their system
-    return 0
 
 
 # --- writing -----------------------------------------------------------------------------------------------------------
@@ -657,35 +423,6 @@ def _copy_all(
         _copy(connection, names, table, columns, types, version_id, rows)
 
 
-def _views(connection: psycopg.Connection[Any], where: StoreAddress, model_id: int, srid: int) -> None:
-    """Views of the newest version with typed geometry, so that QGIS opens them with a click."""
-    from psycopg import sql
-
-    for table, kind in (("track", "LineString"), ("node", "Point"), ("milepost", "Point")):
-        columns = {
-            "track": ("track", "line", "name", "length_m", "start_km", "end_km", "start_node", "end_node"),
-            "node": ("node", "kind"),
-            "milepost": ("track", "offset_m", "chainage_m"),
-        }[table]
-        view = sql.SQL("{}.{}").format(sql.Identifier(where.schema), sql.Identifier(f"{where.model[:40]} {table}s"))
-        connection.execute(sql.SQL("DROP VIEW IF EXISTS {}").format(view))
-        connection.execute(
-            sql.SQL(
-                "CREATE VIEW {} AS SELECT ordinal + 1 AS fid, {}, ST_Force3D(geom)::geometry({}Z, {}) AS geom FROM {}.{} "
-                "WHERE version_id = (SELECT version_id FROM {}.version WHERE model_id = {} ORDER BY version DESC LIMIT 1)"
-            ).format(
-                view,
-                sql.SQL(", ").join(map(sql.Identifier, columns)),
-                sql.SQL(kind),  # one of two constants
-                sql.Literal(srid),
-                sql.Identifier(where.schema),
-                sql.Identifier(table),
-                sql.Identifier(where.schema),
-                sql.Literal(model_id),
-            )
-        )
-
-
 def _packed_records(model: TrackModel, where: StoreAddress) -> bytes | None:
     """The survey records of a model as a GeoPackage of their own; None where it has none."""
     records = model.records
@@ -712,17 +449,17 @@ def _find(
     connection: psycopg.Connection[Any], where: StoreAddress
 ) -> tuple[StoreAddress, int, dict[str, Any], dict[str, Any]]:
     """The version that an address means: the address in full, its key, its plane and its provenance."""
-    if not _exists(connection, where):
+    if not has_tables(connection, where):
         raise ModelError("holds no models", file=str(where), remedy="save one, or name the schema by &schema=")
-    names = _names(where)
-    models = [row[0] for row in connection.execute(_text("SELECT name FROM {s}.model ORDER BY name", names))]
+    names = store_names(where)
+    models = [row[0] for row in connection.execute(phrase("SELECT name FROM {s}.model ORDER BY name", names))]
     model = where.model or (models[0] if len(models) == 1 else "")
     if model not in models:
         listed = ", ".join(models[:10]) or "none"
         what = f"has no model {where.model!r}" if where.model else "holds several models and none is named"
         raise ModelError(what, file=str(where), remedy=f"it has {listed}")
     row = connection.execute(
-        _text(
+        phrase(
             "SELECT v.version_id, v.version, v.schema_version, v.created_by, v.crs, v.provenance FROM {s}.version v "
             "JOIN {s}.model m USING (model_id) WHERE m.name = %s AND (%s::int IS NULL OR v.version = %s) "
             "ORDER BY v.version DESC LIMIT 1",
@@ -732,7 +469,7 @@ def _find(
     ).fetchone()
     if row is None:
         newest = connection.execute(
-            _text("SELECT max(version) FROM {s}.version JOIN {s}.model USING (model_id) WHERE name = %s", names),
+            phrase("SELECT max(version) FROM {s}.version JOIN {s}.model USING (model_id) WHERE name = %s", names),
             (model,),
         ).fetchone()
         raise ModelError(
@@ -781,7 +518,7 @@ def _read_knots(
     from psycopg import sql
 
     counts = connection.execute(
-        _text("SELECT knots FROM {s}.knots WHERE version_id = %s ORDER BY ordinal", names), (version_id,)
+        phrase("SELECT knots FROM {s}.knots WHERE version_id = %s ORDER BY ordinal", names), (version_id,)
     ).fetchall()
     count = np.array([row[0] for row in counts], np.int64)
     if len(count) != tracks or (count < 2).any():
@@ -825,9 +562,9 @@ class _Records:
         self._where, self._version_id = where, version_id
 
     def __call__(self) -> Any:
-        with _connected(self._where) as connection, connection.cursor(binary=True) as cursor:
+        with connected(self._where) as connection, connection.cursor(binary=True) as cursor:
             row = cursor.execute(
-                _text("SELECT container FROM {s}.records WHERE version_id = %s", _names(self._where)),
+                phrase("SELECT container FROM {s}.records WHERE version_id = %s", store_names(self._where)),
                 (self._version_id,),
             ).fetchone()
         if row is None:

@@ -19,7 +19,7 @@ import railnav
 from railnav.cli import main
 from railnav.errors import ModelError, RailnavError
 from railnav.geodesy import choose_frame
-from railnav.io import postgis
+from railnav.io import postgis, postgis_server
 from railnav.io.store_address import is_store, store_address
 from railnav.track.model import TrackModel
 from railnav.track.posts import references_from_posts
@@ -139,10 +139,10 @@ def test_one_writer_at_a_time(server, model, monkeypatch):
     """While one transaction holds a model's lock, another waits and is refused by name; readers go on with what there is."""
     address = f"{server}?model=locked"
     postgis.write_model(model, address)
-    monkeypatch.setattr(postgis, "LOCK_TIMEOUT", 1)
+    monkeypatch.setattr(postgis_server, "LOCK_TIMEOUT", 1)
     where = store_address(address)
     with psycopg.connect(server) as holder:
-        postgis._lock(holder, where)
+        postgis.hold_lock(holder, where)
         begin = time.monotonic()
         with pytest.raises(ModelError, match="another writer is saving this model"):
             postgis.write_model(model, address)
@@ -194,7 +194,7 @@ def test_a_failed_save_leaves_nothing(server, model, monkeypatch):
     def fail(*_: object) -> None:
         raise ValueError("halfway")
 
-    monkeypatch.setattr(postgis, "_views", fail)
+    monkeypatch.setattr(postgis, "show_newest", fail)
     with pytest.raises(ValueError, match="halfway"):
         postgis.write_model(model, address)
     monkeypatch.undo()
@@ -258,7 +258,7 @@ def test_refusals_name_the_store_and_no_password(server, model):
 
 def test_a_statement_has_a_limit(server, model, monkeypatch):
     postgis.write_model(model, f"{server}?model=slow")
-    monkeypatch.setattr(postgis, "STATEMENT_TIMEOUT", 0.001)
+    monkeypatch.setattr(postgis_server, "STATEMENT_TIMEOUT", 0.001)
     monkeypatch.setattr(
         postgis,
         "_find",
@@ -266,7 +266,7 @@ def test_a_statement_has_a_limit(server, model, monkeypatch):
     )
     monkeypatch.setattr(
         postgis,
-        "_limit",
+        "set_limits",
         lambda connection, **_: connection.execute("SELECT set_config('statement_timeout', '50', true)"),
     )
     with pytest.raises(ModelError, match="a statement took more than"):
