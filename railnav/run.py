@@ -151,11 +151,15 @@ class GyroAnglesStream:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GaugeStream:
-    """Gauge sensor: time, s; gauge and, where measured, cant, m; each (m,)."""
+    """Gauge sensor: time, s; gauge and, where measured, cant, m; each (m,).
+
+    `reference_rail` is the rail ("left" or "right" of the vehicle) that the run's lever arms count from; empty: they count from the axis.
+    """
 
     time: FloatArray
     gauge: FloatArray
     cant: FloatArray | None = None
+    reference_rail: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -68,6 +68,10 @@ class _Odometer(_Stream):
     signed: bool = False
 
 
+class _Gauge(_Stream):
+    reference_rail: Literal["", "left", "right"] = ""
+
+
 class _Head(Struct):
     id: Annotated[str, Meta(min_length=1)]
     start: Any
@@ -80,7 +84,7 @@ class _Contents(Struct):
     imu: _Imu | None = None
     odometer: _Odometer | None = None
     gyro_angles: _Stream | None = None
-    gauge: _Stream | None = None
+    gauge: _Gauge | None = None
     balise: _Stream | None = None
 
 
@@ -192,7 +196,7 @@ def read_run(folder: str | Path, *, report: Callable[[LogSummary], None] | None 
         imu=_imu(tables["imu"], time["imu"], contents.imu, folder) if contents.imu else None,
         odometer=_odometer(tables["odometer"], time["odometer"], contents.odometer) if contents.odometer else None,
         gyro_angles=_gyro_angles(tables["gyro_angles"], time["gyro_angles"]) if contents.gyro_angles else None,
-        gauge=_gauge(tables["gauge"], time["gauge"]) if contents.gauge else None,
+        gauge=_gauge(tables["gauge"], time["gauge"], contents.gauge) if contents.gauge else None,
         balise=_balise(tables["balise"], time["balise"]) if contents.balise else None,
         source=folder,
     )
@@ -398,6 +402,8 @@ def _contents_text(run: Run) -> str:
             lines.append(f"mounting_deg = {_vector(np.rad2deg(stream.mounting), 8)}")
         if isinstance(stream, OdometerStream) and stream.signed:
             lines.append("signed = true")
+        if isinstance(stream, GaugeStream) and stream.reference_rail:
+            lines.append(f'reference_rail = "{stream.reference_rail}"')
     return "\n".join(lines) + "\n"
 
 
@@ -514,9 +520,10 @@ def _gyro_angles(table: Table, time: FloatArray) -> GyroAnglesStream:
     return GyroAnglesStream(time, roll, pitch, heading)
 
 
-def _gauge(table: Table, time: FloatArray) -> GaugeStream:
+def _gauge(table: Table, time: FloatArray, stream: _Gauge) -> GaugeStream:
     cant = _known(table, "cant_mm")
-    return GaugeStream(time, freeze(table.number["gauge_mm"] / 1000), None if cant is None else freeze(cant / 1000))
+    gauge = freeze(table.number["gauge_mm"] / 1000)
+    return GaugeStream(time, gauge, None if cant is None else freeze(cant / 1000), stream.reference_rail)
 
 
 def _balise(table: Table, time: FloatArray) -> BaliseStream:

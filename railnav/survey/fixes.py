@@ -178,6 +178,15 @@ def _odometer(run: Run) -> tuple[FloatArray, FloatArray] | None:
     return np.asarray(odometer.time), np.append(0.0, np.cumsum(mean * np.diff(odometer.time)))
 
 
+def _from_axis(run: Run, time: FloatArray) -> FloatArray:
+    """How far to the vehicle's right of the axis the point lies that lever arms count from: half the gauge, where that is a rail."""
+    gauge = run.gauge
+    if gauge is None or not gauge.reference_rail or len(gauge.time) == 0:
+        return np.zeros(len(time))
+    half = 0.5 * np.interp(time, gauge.time, gauge.gauge)
+    return half if gauge.reference_rail == "right" else -half
+
+
 def _lowered(
     run: Run,
     frame: GridFrame,
@@ -189,10 +198,11 @@ def _lowered(
 ) -> tuple[FloatArray, FloatArray, FloatArray, float, FloatArray]:
     """Bring antenna positions down to the reference point: position, and what of the lever arm is still to be taken off in plan."""
     n = len(time)
-    if not lever_b.any():
-        return east, north, up, 0.0, np.zeros(n)
-    forward, right, down = (float(v) for v in lever_b)
     angles, gauge = run.gyro_angles, run.gauge
+    right: FloatArray = np.full(n, float(lever_b[1])) + _from_axis(run, time)
+    if not lever_b.any() and not right.any():
+        return east, north, up, 0.0, np.zeros(n)
+    forward, down = float(lever_b[0]), float(lever_b[2])
     if angles is not None and len(angles.time) >= 2:
         roll = np.interp(time, angles.time, angles.roll)
         pitch = np.interp(time, angles.time, angles.pitch)

@@ -27,6 +27,8 @@ REACH = 60.0
 LONE_END = 500.0
 #: Fixes of such a length at an end that lie beyond a gap of this length, m, are cut off with it.
 ISLAND_GAP = 200.0
+#: Of receivers better than this, m, stated sigmas that grow with the errors are believed, within this range of their median.
+TOLD, TOLD_RANGE = 0.75, (0.3, 5.0)
 #: Beyond this many sigma a node mean begins to lose weight (Huber).
 HUBER = 2.5
 #: A fix this many sigma off the axis is a gross error.
@@ -325,15 +327,33 @@ def white_variances(P: Profiles, residual: FloatArray, errors: list[ErrorModel],
         # nodes that err together: the doubt of one counts for all of them
         pace = float(np.median(np.abs(np.diff(P.time[k][known])))) if np.count_nonzero(known) > 1 else 1.0
         together = max(1.0, 2.0 * model.memory / max(pace, 1e-3))
-        doubt = np.zeros(len(count))
+        doubt, scale = np.zeros(len(count)), np.ones(len(count))
         stated = P.sigma[k][known]
         if np.isfinite(stated).any():
             ratio = stated / float(np.nanmedian(stated))
-            doubt += np.where(np.isfinite(ratio), np.maximum(ratio**2 - 2.0, 0.0), 0.0)
-        strain = np.maximum(np.abs(residual[k][known]) - slack, 0.0) / (HUBER * model.total)
+            if model.total < TOLD and _tells(ratio, residual[k][known]):
+                scale = np.where(np.isfinite(ratio), np.clip(ratio, *TOLD_RANGE) ** 2, 1.0)
+            else:
+                doubt += np.where(np.isfinite(ratio), np.maximum(ratio**2 - 2.0, 0.0), 0.0)
+        strain = np.maximum(np.abs(residual[k][known]) - slack, 0.0) / (HUBER * model.total * np.sqrt(scale))
         doubt += np.maximum(strain - 1.0, 0.0) + np.maximum(strain**2 - 1.0, 0.0)
-        variance[k, known] = model.white**2 / count + doubt * model.total**2 * together
+        variance[k, known] = scale * model.white**2 / count + doubt * model.total**2 * together
     return variance
+
+
+def _tells(ratio: FloatArray, residual: FloatArray) -> bool:
+    """Whether stated sigmas tell how large errors are (a base station far or near): residuals grow with them."""
+    ok = np.isfinite(ratio) & np.isfinite(residual)
+    if np.count_nonzero(ok) < 80:
+        return False
+    low, high = np.quantile(ratio[ok], [0.25, 0.75])
+    if high < 1.3 * low:
+        return False
+
+    def spread(rows: BoolArray) -> float:
+        return float(np.median(np.abs(residual[ok & rows])))
+
+    return spread(ratio >= high) > 1.25 * spread(ratio <= low)
 
 
 def choose_noise(chain: Chain) -> float:

@@ -522,3 +522,30 @@ def test_repeatability_between_dates_is_a_histogram():
     assert 0.97 * told["points"] <= sum(told["counts"]) <= told["points"]
     assert 0.004 < told["rms_m"] < 0.03  # 17 mm white and 10 mm correlated, smoothed, of two runs
     assert report(build(runs[:1]))["repeatability"] == []
+
+
+def test_stated_sigmas_that_grow_with_the_errors_are_used():
+    """Base stations 50 to 100 km apart: errors grow with the distance, and the receiver says so."""
+    frame, axis = plane(), centre_line(6, 4.0, frame=plane())
+    rms_of = {}
+    for told in (True, False):
+        rng = np.random.default_rng(3)
+        runs = []
+        for p in range(3):
+            run = drive(
+                axis, frame, rng, run_id=f"r{p}", direction="up", day=p, receiver=Receiver("far", correlated=0.0)
+            )
+            share = np.linspace(0.0, 1.0, len(run.gnss)) if p % 2 else np.linspace(1.0, 0.0, len(run.gnss))
+            sigma = 0.01 + 0.12 * share
+            north, east = (rng.standard_normal(len(sigma)) * sigma / 6.37e6 for _ in range(2))
+            runs.append(
+                changed(
+                    run,
+                    latitude=run.gnss.latitude + north,
+                    longitude=run.gnss.longitude + east / np.cos(np.radians(50.0)),
+                    sigma_east=sigma if told else None,
+                    sigma_north=sigma if told else None,
+                )
+            )
+        rms_of[told] = rms(build(runs), "up", axis)
+    assert rms_of[True] < 0.8 * rms_of[False]

@@ -79,3 +79,18 @@ def test_too_few_fixes_are_refused_by_name():
     run, frame, _, _ = straight_run(9)
     with pytest.raises(RunError, match=r"^a: 9 usable fixes of 9; a survey run needs at least 10; leave this run out"):
         gather(run, frame)
+
+
+@pytest.mark.parametrize("rail", ["left", "right"])
+def test_a_reference_rail_is_moved_to_the_axis_by_half_the_gauge(rail, tmp_path):
+    from railnav.io.run import read_run, write_run
+
+    plain, frame, _, _ = straight_run()
+    time = np.asarray(plain.gnss.time)
+    gauge = GaugeStream(time=time, gauge=np.full(len(time), 1.52), reference_rail=rail)
+    run = replace(plain, gauge=gauge)
+    a, b = gather(plain, frame), gather(run, frame)
+    # what stands to the right of the axis is still to be taken off along the track's normal
+    assert np.allclose(b.right - a.right, 0.76 if rail == "right" else -0.76)
+    write_run(run, tmp_path / "run")
+    assert read_run(tmp_path / "run").gauge.reference_rail == rail
