@@ -306,6 +306,10 @@ class GridFrame:
         length = projection_of(self.pipeline).ground_length(*(v.ravel() for v in (e1, n1, h1, e2, n2, h2)))
         return _shaped(length, e1)
 
+    def __str__(self) -> str:
+        """The plane's name."""
+        return self.name
+
     @property
     def authority(self) -> tuple[str, int] | None:
         """Registry and code, e.g. ("EPSG", 28409), or None for a system that no registry lists."""

@@ -455,3 +455,8 @@ def test_a_foreign_pipeline_is_refused():
         GridFrame("", "", "proj=nonsense", "", 0.0).to_grid(0.8, 0.3, 0.0)
     with pytest.raises(CrsError, match="no map projection"):
         GridFrame("", "", "proj=noop", "", 0.0).convergence(0.0, 0.0)
+
+
+def test_a_plane_is_called_by_its_name():
+    frame = choose_frame(*BUDAPEST)
+    assert str(frame) == f"{frame}" == frame.name
