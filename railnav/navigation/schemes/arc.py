@@ -113,7 +113,7 @@ class ArcNavigator:
 
     Notes
     -----
-    State: up to six places of five numbers, and a dozen more; some 200 multiplications an epoch, which is what a port to a small computer needs.
+    State: up to six places of five numbers, and a dozen more; some 200 multiplications an epoch, what a port to a small computer needs.
     In Python a step takes 30 microseconds, as much as the compiled filter of `Navigator`: use that where you can, it knows what its
     sensors are worth. A train is taken to move forward when it is first seen to move.
 
