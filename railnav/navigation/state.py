@@ -251,7 +251,7 @@ class Settings:
     gnss_fault: float = 1e-3
     balise_missed: float = 1e-3
     curvature_sigma: float = 2e-5
-    curvature_shift: float = 0.15
+    curvature_shift: float = 0.4
     curvature_length: float = 20.0
     course_doubt: float = 0.01
     curvature_doubt: float = 2e-4
