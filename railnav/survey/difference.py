@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railnav.errors import CrsError, ModelError
+from railnav.estimation.change import windows
 from railnav.estimation.gross_error import chi_square_limit
-from railnav.estimation.merging import windows
 from railnav.survey.offsets import HOLD, robust_fit
 from railnav.survey.refining import CLEAR, FEWEST_WINDOWS, WINDOW_LENGTH, WINDOW_NODES
 from railnav.survey.updating import digest

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from railnav.estimation.change import change_test
 from railnav.estimation.gross_error import chi_square_limit
-from railnav.estimation.merging import ChainRecords, change_test
+from railnav.estimation.merging import ChainRecords
 from railnav.survey import _kernels, surveyed
 from railnav.survey.angles import slopes_of
 from railnav.survey.axis import Chain, ErrorModel, Estimate, Links, Slopes, smooth_links, solve, sweep

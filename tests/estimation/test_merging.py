@@ -386,7 +386,7 @@ def test_10_mm_over_60_m_is_found_in_95_of_100_cases_false_alarms_1_in_100() -> 
 
 
 def test_window_covariance_is_the_dense_one() -> None:
-    from railnav.estimation.merging import _window_covariance
+    from railnav.estimation.change import _window_covariance
 
     chain = random_chain(12)
     solution = solve_chain(chain)
@@ -474,3 +474,45 @@ def test_line_that_moved_as_a_whole_and_line_of_one_window() -> None:
     assert abs(d - 1900) < 20
     assert test.nodes(margin=20)[[300, 339, 1500, 1899]].all()
     assert not test.nodes(margin=20)[[0, 200, 800, 2000]].any()
+
+
+def test_windows_of_unequal_spacing_are_the_dense_covariance() -> None:
+    from railnav.estimation.change import _window_covariance, windows
+
+    rng = np.random.default_rng(12)
+    n, N = 3, 40
+    chain = Chain(
+        rng.normal(size=(N, 2, n)), rng.normal(size=(N, 2)), rng.normal(size=(N - 1, n, n)), rng.normal(size=(N - 1, n, n)),
+        rng.normal(size=(N - 1, n)), prior=(np.eye(n), np.zeros(n)),
+    )  # fmt: skip
+    solution = solve_chain(chain)
+    nodes = np.array([[0, 3, 4, 9], [20, 22, 30, 39]])
+    joint = windows(solution, nodes)
+    for w, row in enumerate(nodes):
+        for a in range(4):
+            for b in range(a, 4):
+                assert joint[w, a, b] == pytest.approx(
+                    solution.cross_covariance(row[a], row[b])[0, 0], rel=1e-9, abs=1e-14
+                )
+    even = np.array([[0, 5, 10], [7, 12, 17]])
+    E = np.broadcast_to(np.eye(1, n), (N, 1, n))
+    assert np.allclose(windows(solution, even), _window_covariance(solution, even, E), rtol=1e-10)
+    with pytest.raises(EstimationError, match="must grow"):
+        windows(solution, [[3, 3]])
+
+
+def test_surveys_that_differ_more_than_they_state_are_allowed_for() -> None:
+    rng = np.random.default_rng(13)
+    N = 2000
+
+    def survey(scale: float):
+        z = 100.0 * scale * 0.01 * rng.standard_normal((N, 1))
+        u = 1e3 * scale * 1e-3 * rng.standard_normal((N - 1, 1))
+        return solve_chain(Chain([[100.0]], z, [[-1e3]], [[1e3]], u))
+
+    honest = change_test(survey(1.0), survey(1.0))
+    assert 1.0 <= honest.excess < 1.5
+    wild = change_test(survey(3.0), survey(3.0))
+    assert wild.changed.any()
+    assert wild.excess == pytest.approx(9.0, rel=0.4)
+    assert not change_test(survey(3.0), survey(3.0), variance_factor=wild.excess).changed.any()
