@@ -32,8 +32,6 @@ FloatArray = NDArray[np.float64]
 
 #: Twist bases used by default, m.
 TWIST_BASES = (3.0, 9.0)
-#: Samples farther apart than this do not meet EN 13848-1, m.
-FINEST_REQUIRED = 0.5
 #: Shortest wavelength that is asked of GNSS positions, m.
 SHORTEST_GNSS = 200.0
 #: A displacement's wavelength needs this many samples.

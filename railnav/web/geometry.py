@@ -367,7 +367,7 @@ def _lead(report: Report, shown: Sequence[Exceedance]) -> str:
             text += f"within {words.length(best.sigma, 2)} for the longest."
         return text
     severe = sum(e.level == "immediate" for e in shown)
-    text += f"Held against limits: {', '.join(judged).lower()}. "
+    text += f"Held against limits: {', '.join(judged)}. "
     if not shown:
         return text + "Nothing is beyond a limit in the latest run."
     return (

@@ -158,6 +158,7 @@ def test_coarse_streams_are_refused_band_by_band_with_the_reason():
     assert "GNSS" not in made.refused["longitudinal_level_d1"]
     assert "longitudinal_level_d2" in made.channels
     assert "base of 3 m takes 1.5 m" in made.refused["twist_3m"]
+    assert any("shorter defects are missed" in note for note in made.recording.notes)
 
 
 def test_gnss_alone_gives_long_waves_and_says_what_it_would_leave_in_the_bands():
