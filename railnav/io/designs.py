@@ -182,7 +182,8 @@ def _inside(profile: Gradients, i: int, a: float, b: float) -> tuple[FloatArray,
 
 
 def _read_landxml(path: Path, crs: str) -> tuple[Design, ...]:
-    from railnav.io.landxml import _direction_unit, _document, _local, _read_alignment
+    from railnav.io.landxml import _direction_unit, _document, _read_alignment
+    from railnav.io.xml_document import local_name as _local
 
     root = _document(path)
     unit = _direction_unit(root, path)

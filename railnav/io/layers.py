@@ -226,7 +226,8 @@ def _laid_into(
     latitude, longitude, _ = own.to_geodetic(every[:, 0], every[:, 1], None)
     frame = choose_frame(latitude, longitude, crs=crs, zone_width=zone_width, ellipsoid=ellipsoid)
     return frame, [
-        [np.column_stack(frame.to_grid(*own.to_geodetic(p[:, 0], p[:, 1], p[:, 2]))) for p in pieces] for pieces in parts
+        [np.column_stack(frame.to_grid(*own.to_geodetic(p[:, 0], p[:, 1], p[:, 2]))) for p in pieces]
+        for pieces in parts
     ]
 
 
