@@ -170,6 +170,12 @@ def _refuse_strangers(runs: Sequence[Run]) -> None:
 def _frame(runs: Sequence[Run], crs: str | None, zone_width: Literal[3, 6], ellipsoid: str) -> GridFrame:
     from railnav.geodesy.grid import choose_frame
 
+    fixed = {run.gnss.fixed_to: run.id for run in runs if run.gnss is not None and run.gnss.fixed_to}
+    if len(fixed) > 1:
+        named = ", ".join(f"{datum} ({run})" for datum, run in sorted(fixed.items()))
+        raise RunError(
+            f"runs are fixed to several datums: {named}", column="gnss.fixed_to", remedy="fix all to one of them"
+        )
     latitude = np.concatenate([r.gnss.latitude[:: max(1, len(r.gnss) // 500)] for r in runs if r.gnss is not None])
     longitude = np.concatenate([r.gnss.longitude[:: max(1, len(r.gnss) // 500)] for r in runs if r.gnss is not None])
     return choose_frame(latitude, longitude, crs=crs, zone_width=zone_width, ellipsoid=ellipsoid)

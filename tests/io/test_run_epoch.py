@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+import railnav
 from railnav.errors import RunError
 from railnav.geodesy import WGS84
 from railnav.geodesy.plates import plate_motion
@@ -37,6 +38,18 @@ def test_the_start_is_the_epoch_unless_one_is_given(tmp_path):
     np.testing.assert_allclose(cartesian(moved), cartesian(given), atol=2e-4)
     np.testing.assert_allclose(cartesian(moved), cartesian(dated), atol=2e-4)
     assert (given.gnss.epoch, given.gnss.fixed_to, plain.gnss.epoch) == (2026.5, "ETRS89", None)
+
+
+def test_one_model_has_one_datum(tmp_path):
+    """Runs carried to ETRS89 and to GSK-2011 lie decimetres apart: a build of both is refused."""
+    runs = [
+        read_run(write(tmp_path / name, f'frame = "ITRF2020"\nfixed_to = "{datum}"'))
+        for name, datum in (("a", "ETRS89"), ("b", "GSK-2011"))
+    ]
+    parted = np.linalg.norm(cartesian(runs[0]) - cartesian(runs[1]), axis=1)
+    assert parted.min() > 0.3
+    with pytest.raises(RunError, match=r"fixed to several datums: ETRS89 \(r\), GSK-2011 \(r\)"):
+        railnav.build(runs)
 
 
 def test_info_says_so(tmp_path):
