@@ -175,7 +175,8 @@ def fit_design(
     chosen = _resolution_of(axis, sigma)
     rows = np.arange(0, len(axis.along), chosen.every)
     along, east, north = axis.along[rows], axis.easting[rows], axis.northing[rows]
-    noise, pieces, ref = _segment(along, east, north, chosen, sigma)
+    largest = 0.0 if axis.stated is None else 1.5 * float(np.median(axis.stated[:, 0]))
+    noise, pieces, ref = _segment(along, east, north, chosen, sigma, largest)
     tell(label, 1, total)
     white = np.full(len(along), float(np.mean(noise.sigma)))
     per_point = np.sqrt(white**2 + noise.correlated**2) if noise.correlated > 0.0 else white
@@ -264,7 +265,7 @@ def _resolution_of(axis: Axis, sigma: float | None) -> Resolution:
 
 
 def _segment(
-    along: FloatArray, east: FloatArray, north: FloatArray, chosen: Resolution, sigma: float | None
+    along: FloatArray, east: FloatArray, north: FloatArray, chosen: Resolution, sigma: float | None, largest: float
 ) -> tuple[Noise, Pieces, tuple[FloatArray, ...]]:
     white = chosen.sigma
     window = float(np.clip((720.0 * chosen.spacing * white**2 / 1e-6) ** 0.2, 6.5 * chosen.spacing, 120.0))
@@ -279,7 +280,7 @@ def _segment(
             along[part], east[part], north[part], noise, window=window, curvature_scale=bend, rate_scale=rate, beam=beam
         )
 
-    noise = likeliest(pieces, len(along), chosen.spacing, white, floor=FLOOR, stated=sigma)
+    noise = likeliest(pieces, len(along), chosen.spacing, white, floor=FLOOR, stated=sigma, largest=largest)
     return noise, pieces(noise, slice(0, len(along)), segmentation.BEAM), ref
 
 
@@ -351,17 +352,32 @@ def _tried(
     edges = fit.chain.edges
     low = np.array([edges[edit.first] for edit in edits]) - _AROUND
     high = np.array([edges[edit.last] for edit in edits]) + _AROUND
-    try:
-        trial = fit_plan(judgement.chain_of(judgement.applied(items, edits)), fit.along, east, north, sigma)
-    except EstimationError:
-        return fit
-    dearer = (judgement.squares_between(trial, low, high) - judgement.squares_between(fit, low, high)) / spread
-    good = [e for e, cost in zip(edits, dearer.tolist(), strict=True) if cost < _DEARER * e.fewer]
-    if len(good) == len(edits):
-        return trial
-    if not good:
-        return fit
-    return fit_plan(judgement.chain_of(judgement.applied(items, good)), fit.along, east, north, sigma)
+
+    def tried(some: list[judgement.Edit]) -> PlanFit | None:
+        try:
+            return fit_plan(judgement.chain_of(judgement.applied(items, some)), fit.along, east, north, sigma)
+        except EstimationError:
+            return None
+
+    def worth(found: PlanFit | None, some: list[judgement.Edit]) -> bool:
+        saved = _DEARER * sum(edit.fewer for edit in some)
+        return found is not None and found.cost < fit.cost + spread * saved
+
+    trial = tried(edits)
+    good: list[judgement.Edit] = []
+    if trial is not None:
+        dearer = (judgement.squares_between(trial, low, high) - judgement.squares_between(fit, low, high)) / spread
+        good = [e for e, cost in zip(edits, dearer.tolist(), strict=True) if cost < _DEARER * e.fewer]
+        if len(good) == len(edits) and worth(trial, edits):
+            return trial
+    # where the steps did not lead there with all of them, with fewer
+    batch = good or edits[: len(edits) // 2]
+    while batch:
+        trial = tried(batch)
+        if trial is not None and worth(trial, batch):
+            return trial
+        batch = batch[: len(batch) // 2]
+    return fit
 
 
 def _with_laws(

@@ -108,6 +108,7 @@ def likeliest(
     *,
     floor: float,
     stated: float | None = None,
+    largest: float = 0.0,
 ) -> Noise:
     """Noise under which the points, elements and all, are likeliest.
 
@@ -123,6 +124,8 @@ def likeliest(
         Least white noise, m.
     stated : float, optional
         White noise that the user states, m: then it stays, and only waves are looked for.
+    largest : float
+        Waves may be as large as this in any case: what smoothed points state of themselves, m.
     """
     if count <= _JUDGED:
         stretches = [slice(0, count)]
@@ -151,7 +154,7 @@ def likeliest(
     if sigma <= 1.01 * floor and stated is None:
         return plain  # exact points have no waves
     white = 0.3 * sigma if stated is None else stated
-    most = _LARGEST * sigma * max(1.0, spacing**-0.5)
+    most = max(_LARGEST * sigma * max(1.0, spacing**-0.5), largest)
     place = (float(np.log(white)), float(np.log(1.2 * sigma)), float(np.log(8.0 * spacing)))
     known = {place: cost(noise_of(place))}
     low = (np.log(floor), np.log(1e-3 * sigma), np.log(2.0 * spacing))
