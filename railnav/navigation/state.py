@@ -209,8 +209,8 @@ class Settings:
     """
 
     gnss_correlation_time: float = 60.0
-    gnss_correlated_share: float = 0.95
-    gnss_white_share: float = 0.25
+    gnss_correlated_share: float = 0.9
+    gnss_white_share: float = 0.5
     gnss_frame_share: float = 0.3
     frame_sigma_least: float = 0.01
     frame_sigma_most: float = 20.0
