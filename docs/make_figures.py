@@ -64,7 +64,8 @@ PAGES = {
             Section(
                 "records",
                 "Surveys that are refined: honesty by kind, sequential against batch, slews found, a real line updated",
-                "Simulated but for the last part: whether the stated covariance holds for each kind of survey (NEES is 1 when it does; three "
+                "Simulated but for the last part: whether the stated covariance holds for each kind of survey (NEES "
+                "is 1 when it does; three "
                 "passes over 4 km tell little of correlated errors, so that single builds scatter), tunnels with and without gyroscopic "
                 "angles, updates against builds of all runs, and slews that an update finds.",
                 "python benchmarks/records.py",
@@ -105,14 +106,16 @@ PAGES = {
             Section(
                 "monte-carlo",
                 "What the navigator promises, by seeded Monte Carlo",
-                "Simulated, on the bundled line, each case with its bar. The open-sky bar comes from a filter that is told the noise (white "
+                "Simulated, on the bundled line, each case with its bar. The open-sky bar comes from a filter that "
+                "is told the noise (white "
                 "1.5 m); the navigator assumes coloured errors, as receivers have them, and is shown on both.",
                 "python benchmarks/monte_carlo.py",
             ),
             Section(
                 "faults",
                 "Named faults",
-                "What goes wrong with sensors, simulated, and what the navigator makes of it. `railnav simulate --list-faults` says what each is.",
+                "What goes wrong with sensors, simulated, and what the navigator makes of it. `railnav simulate "
+                "--list-faults` says what each is.",
                 "python benchmarks/faults.py",
             ),
             Section(
@@ -141,14 +144,16 @@ PAGES = {
                 "geometry",
                 "Track geometry: channels, defects, overlay, trends, lining (simulated)",
                 "Recording cars on irregular track of the bundled line, everything simulated: filters against sinusoids, chords, channels "
-                "against the fields they drove over, defects found and false, runs over each other, growth, the measured axis, and how fast.",
+                "against the fields they drove over, defects found and false, runs over each other, growth, the "
+                "measured axis, and how fast.",
                 "python benchmarks/geometry.py",
             ),
             Section(
                 "outages",
                 "Real drive without a map: an aided IMU with RTK withheld",
                 "A car with RTK GNSS and a low-cost IMU; the fixes left out are the truth. Causal and smoothed, with and without what "
-                "wheels can do (non-holonomic constraint, zero-velocity updates); mounting, arms, time offset and scale factors are estimated.",
+                "wheels can do (non-holonomic constraint, zero-velocity updates); mounting, arms, time offset and "
+                "scale factors are estimated.",
                 "python benchmarks/outages.py",
                 real_data=True,
             ),
@@ -168,8 +173,10 @@ PAGES = {
             Section(
                 "formats",
                 "Networks of other programs, in and out",
-                "Cologne's railways from OpenStreetMap, 11 alignments of SBB's LandXML, Mannheim's table of tram axes, each against its own "
-                "figures: joints, cant, profile, node coordinates, movements, what validate finds. Then models written in each format, read "
+                "Cologne's railways from OpenStreetMap, 11 alignments of SBB's LandXML, Mannheim's table of tram "
+                "axes, each against its own "
+                "figures: joints, cant, profile, node coordinates, movements, what validate finds. Then models "
+                "written in each format, read "
                 "back and compared metre by metre; railML carries no cant.",
                 "python benchmarks/formats.py",
                 real_data=True,

@@ -42,7 +42,8 @@ if TYPE_CHECKING:
     from railnav.navigation import Mode, Navigator, Solution, navigate
     from railnav.run import Run
     from railnav.simulation import demo_line, simulate
-    from railnav.survey import build, difference, update
+    from railnav.survey import build, update
+    from railnav.survey.difference import difference
     from railnav.track import TrackModel, validate
     from railnav.truth import Truth
 

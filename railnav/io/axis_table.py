@@ -121,7 +121,9 @@ def _read_track(
         table.refuse(int(rows[0]), "n", f"track {track[:60]!r} has one point only", "a track needs two")
     back = np.flatnonzero(np.diff(number["s"][rows]) < 0.0)
     if len(back):
-        table.refuse(int(rows[back[0] + 1]), "s", f"stations of track {track[:60]!r} do not grow", "order the rows by s")
+        table.refuse(
+            int(rows[back[0] + 1]), "s", f"stations of track {track[:60]!r} do not grow", "order the rows by s"
+        )
     far = np.flatnonzero(np.abs(np.diff(number["s"][rows]) - number["ds"][rows[1:]]) > _AGREE)
     if len(far):
         i = int(rows[far[0] + 1])

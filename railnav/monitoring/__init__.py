@@ -1,1 +1,1 @@
-"""Track geometry: what shape is the track in, where does it leave its design, and what should the tamping machine do?"""
+"""Track geometry: the shape a track is in, where it leaves its design, and what the tamping machine should do."""
