@@ -262,7 +262,9 @@ def _in_order(table: Table, track: str, rows: IntArray) -> IntArray:
     if len(again):
         i = int(rows[again[0] + 1])
         number = table.number["sequence"][i]
-        table.refuse(i, "sequence", f"{number:g} stands twice in track {track[:60]!r}", "number the elements of a track")
+        table.refuse(
+            i, "sequence", f"{number:g} stands twice in track {track[:60]!r}", "number the elements of a track"
+        )
     return rows
 
 

@@ -76,7 +76,9 @@ def test_repeated_faces_know_the_slow_parts() -> None:
     """In-run biases change from face to face: six faces cannot tell, twelve can, and their sigmas are honest."""
     once, twice = [], []
     for seed in range(30):
-        series = [simulate_positions("six-position", unit="STIM300", seed=seed, duration=20.0, series=k) for k in (0, 1)]
+        series = [
+            simulate_positions("six-position", unit="STIM300", seed=seed, duration=20.0, series=k) for k in (0, 1)
+        ]
         truth = series[0].accelerometer.bias
         one = calibrated(series[0], "six-position")
         assert any("take each face twice" in remark for remark in one.remarks)
