@@ -45,6 +45,8 @@ _FAILED = 5.0
 _STUB = 0.1
 #: Points that lie closer to the axis than their noise count as if they lay this share of its square off.
 _EXACT = 0.25
+#: Nor may the whole get dearer by more than this.
+_DEAREST = 1.3
 #: Rounds of leaving out elements.
 _ROUNDS = 5
 _LAWS = (elements.BLOSS, elements.COSINE, elements.SINE, elements.HELMERT, elements.CUBIC)
@@ -361,7 +363,8 @@ def _tried(
 
     def worth(found: PlanFit | None, some: list[judgement.Edit]) -> bool:
         saved = _DEARER * sum(edit.fewer for edit in some)
-        return found is not None and found.cost < fit.cost + spread * saved
+        most = min(fit.cost + spread * saved, _DEAREST * max(fit.cost, len(fit.along)))
+        return found is not None and found.cost < most
 
     trial = tried(edits)
     good: list[judgement.Edit] = []
@@ -479,7 +482,7 @@ def _spread(fit: PlanFit, noise: Noise) -> float:
     again = 1.0 + 2.0 * noise.length / step * noise.correlated**2 / (white**2 + noise.correlated**2)
     unknown = 2 * len(fit.chain.kind) + 3
     size = fit.cost / max(len(fit.along) - unknown, 1)
-    return again * max(size, _EXACT)  # exact points do not tell more than their rounding
+    return again * float(np.clip(size, _EXACT, 2.0))  # exact points do not tell more than their rounding
 
 
 def _as_found(fit: PlanFit, noise: Noise, sigma: float | None) -> Noise:
