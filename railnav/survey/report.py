@@ -145,11 +145,15 @@ def compose(
 ) -> dict[str, Any]:
     """Write the report of a build as JSON values."""
     home: dict[int, tuple[Surveyed, int, KnotTable]] = {}
-    for t, table in sorted(zip(tracks, tables, strict=True), key=lambda item: len(item[0].nominal)):
-        home.update({i: (t, k, table) for k, i in enumerate(t.runs)})  # the longest track that a run follows
+    most: dict[int, int] = {}
+    for t, table in zip(tracks, tables, strict=True):
+        for k, i in enumerate(t.runs):  # the track on which a run has most of its fixes
+            many = int(np.count_nonzero(np.isfinite(t.laid[k].offset)))
+            if many > most.get(i, -1):
+                most[i], home[i] = many, (t, k, table)
     runs = [_run(survey, i, home.get(i), offsets, up) for i in range(len(survey.fixes))]
     for i, entry in enumerate(runs):
-        entry["tracks"] = [t.name for t in tracks if i in t.runs]
+        entry["tracks"] = [t.name for t in tracks if i in t.runs and t.profile.present[t.runs.index(i)].any()]
     runs += [_refused(run, cause) for run, cause in survey.refused]
     receivers = _receivers(survey, offsets)
     datum = _datum(survey, offsets)
@@ -437,7 +441,7 @@ def _track(survey: Survey, t: Surveyed, table: KnotTable, heights: bool) -> dict
     return {
         "track": t.name,
         "length_m": _number(float(table.offset[-1])),
-        "runs": [survey.fixes[i].run.id for i in t.runs],
+        "runs": [survey.fixes[i].run.id for k, i in enumerate(t.runs) if t.profile.present[k].any()],
         "sigma_cross_m": _number(float(np.median(sigma))),
         "sigma_cross_95_m": _number(float(np.quantile(sigma, 0.95))),
         "heights": heights,
