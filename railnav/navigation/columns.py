@@ -255,6 +255,8 @@ YAW_MISFIT, YAW_SPAN, YAW_DISTRUST = 0.5, 2.0, 60.0
 FORCE_STEP, SCALE_STEP = 0.3, 0.05
 #: How often dead reckoning by the wheel begins anew, s.
 CHECK_INTERVAL = 60.0
+#: Way over which inertial rows count once as evidence of a track, m.
+EVIDENCE_STEP = 1.0
 #: How much weaker the evidence of positions is when model or receiver are off by more than they say: sigmas five times as large.
 DOUBTED = 25.0
 #: Change of curvature a metre that the linearised course allows for, 1/m^2.

@@ -64,6 +64,7 @@ from railnav.navigation.columns import (
     COURSE_NORTH,
     DISTANCE,
     EAST,
+    EVIDENCE_STEP,
     FORCE,
     FORCE_STEP,
     FORGET_WHEEL,
@@ -382,6 +383,7 @@ def inertial_rows(fil, net, shared, bank, work, h, row, dt):
     # what a line does not follow is the same until the train has moved by its own uncertainty
     again = max(1.0, sd / max(abs(v) * dt, 0.01))
     rest = again * max(square - mean * mean - slope * slope, 0.0)
+    counts = min(1.0, abs(v) * dt / EVIDENCE_STEP)  # at walking pace many rows tell of one place
     lean_rest = again * max(lean_square - lean * lean - lean_slope * lean_slope, 0.0)
     slope /= sd
     lean_slope /= sd
@@ -405,7 +407,7 @@ def inertial_rows(fil, net, shared, bank, work, h, row, dt):
         innovation = row[YAW_RATE] - v * (mean + x[i_t] * roll) - x[i_g]
         # tracks side by side differ in curvature by less than a model is wrong: only a turnout's difference is evidence
         doubt = project(P_sqrt, h_row, f) + variance + (v * k[K_CURVATURE_DOUBT]) ** 2
-        credit(bank, h, BY_YAW, -0.5 * (min(innovation * innovation / doubt, ROW_GATE) + math.log(doubt)))
+        credit(bank, h, BY_YAW, -0.5 * counts * (min(innovation * innovation / doubt, ROW_GATE) + math.log(doubt)))
         work.slot[h, S_YAW] = innovation * innovation / (doubt - (v * k[K_CURVATURE_DOUBT]) ** 2)
         robust_row(x, P_sqrt, h_row, innovation, variance, f, keep, move)
         h_row[i_g] = 0.0
@@ -423,7 +425,7 @@ def inertial_rows(fil, net, shared, bank, work, h, row, dt):
         h_row[i_y] = 1.0
         innovation = row[SIDE] - said - x[i_y]
         doubt = project(P_sqrt, h_row, f) + variance + (v * v * k[K_CURVATURE_DOUBT]) ** 2
-        credit(bank, h, BY_SIDE, -0.5 * (min(innovation * innovation / doubt, ROW_GATE) + math.log(doubt)))
+        credit(bank, h, BY_SIDE, -0.5 * counts * (min(innovation * innovation / doubt, ROW_GATE) + math.log(doubt)))
         robust_row(x, P_sqrt, h_row, innovation, variance, f, keep, move)
         h_row[i_y] = 0.0
     h_row[i_s] = 0.0
