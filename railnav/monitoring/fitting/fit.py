@@ -195,6 +195,12 @@ def fit_design(
     tell(label, 3, total)
     if not fit.settled:
         warnings.append(f"track {axis.track}: the elements did not come to rest; their sigmas may be too small")
+    if margin < LAW_WORTH and second:
+        said = {elements.KIND_NAMES[kind] for kind in fit.chain.kind.tolist() if kind >= CLOTHOID}
+        warnings.append(
+            f"track {axis.track}: transitions are given as {' and '.join(sorted(said))}, but {second} fits about as well; their "
+            "lengths depend on it"
+        )
     expected = float(np.hypot(np.mean(noise.sigma), noise.correlated))
     noise = _as_found(fit, noise, sigma)
     if float(np.hypot(np.mean(noise.sigma), noise.correlated)) > _FAILED * expected and sigma is None:
@@ -432,7 +438,7 @@ def _with_laws(
     apart = judgement.squares_between(fit, low, high) / spread + _DEARER * several
     # laws differ by less than a transition shifts its curve, change of curvature times length squared over 24
     telling = np.array([_shift(items[a:b]) > _TELLING * float(sigma[0]) for a, b, _ in spans])
-    apart = np.where(telling, apart, 0.0)
+    apart = np.where(several > 0, np.where(telling, apart, 0.0), np.inf)
     local = {
         law: np.where(telling, judgement.squares_between(found, low, high) / spread, 0.0) for law, found in fits.items()
     }
@@ -440,7 +446,9 @@ def _with_laws(
     cost = {law: float(np.minimum(values, apart).sum()) for law, values in local.items()}
     order = sorted(cost, key=lambda law: cost[law])
     best = order[0] if cost[order[0]] < cost[CLOTHOID] - LAW_WORTH else CLOTHOID
-    second = next((law for law in order if law != best), best)
+    # a cubic parabola is a clothoid to millimetres: between these two no length depends on the choice
+    alike = (CLOTHOID, elements.CUBIC)
+    second = next((law for law in order if law != best and not (law in alike and best in alike)), best)
     margin = cost[second] - cost[best] if second != best else float("nan")
     law_of = np.full(len(spans), best)
     least = local[best] - LAW_ALONE
