@@ -245,7 +245,7 @@ HELD = 0.6
 #: Sigmas past a toe at which a turnout's leg may be declared.
 GUARD = 3.0
 #: A jump of the position beyond this is no step of a GNSS error but a fault, m: the train coasts until fixes fit again ...
-STEP_MOST = 60.0
+STEP_MOST = 25.0
 #: ... for so many seconds, where the train has wheels or inertial sensors to coast on and its place was known for long before.
 COAST_LONGEST = 300.0
 ESTABLISHED = 60.0

@@ -18,11 +18,11 @@ NOT_YET = {
     "gnss-ramp-along-0.1",
     "gnss-ramp-along-0.5",
     "gnss-ramp-left-0.5",
-    "gnss-late-1s",
-    "gnss-late-0.3s",
     "gnss-sigma-third",
     "gnss-frame-9m-south",
     "odometer-dead",
+    "gyro-saturated",
+    "imu-late-0.2s",
 }
 
 ONSET = 130.0
