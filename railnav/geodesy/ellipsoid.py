@@ -219,7 +219,8 @@ class Ellipsoid:
 
         Notes
         -----
-        On the ellipsoid exact for the adopted constants; at height h the linear term leaves 7e-13 h^2 m/s^2.
+        On the ellipsoid exact for the adopted constants; at height h the linear term leaves up to 2.1e-8 h m/s^2 (flattening and
+        rotation, largest at the equator); `railnav.inertial.gravity` has the full form.
 
         References
         ----------
