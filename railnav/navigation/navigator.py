@@ -134,7 +134,7 @@ class Navigator:
 
     Notes
     -----
-    Memory is constant; a step takes some 60 microseconds. Leaving out a sensor that is not there makes it cheaper.
+    Memory is constant; a step takes some 25 microseconds. Leaving out a sensor that is not there makes it cheaper.
 
     Examples
     --------
