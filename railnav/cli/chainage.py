@@ -50,7 +50,7 @@ def command(
 
     \b
     Example:
-      railnav chainage demo/line.gpkg "40,3+25"
+      railnav chainage demo/bundled.gpkg 40,3+25 --line 77
     """  # noqa: D301
     from railnav.cli import _files
     from railnav.cli._terminal import print_facts, print_json, print_table

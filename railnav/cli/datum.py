@@ -23,7 +23,7 @@ def command(ctx: click.Context, as_json: bool) -> None:
 
     \b
     Example:
-      railnav datum fit points.csv --crs "+proj=tmerc +lon_0=35.5 +ellps=krass" -o local.toml
+      railnav datum choices EPSG:28407 --at 55.75,37.6
     """  # noqa: D301
     if ctx.invoked_subcommand is not None:
         return

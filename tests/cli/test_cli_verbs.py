@@ -318,6 +318,7 @@ def test_an_interrupted_demo_leaves_nothing(tmp_path: Path) -> None:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a job in the background ignores it
     )
     time.sleep(2.5)
     process.send_signal(signal.SIGINT)
@@ -347,7 +348,8 @@ def test_the_demo_and_every_example_of_the_help(tmp_path: Path, monkeypatch: pyt
         examples = [line.split() for line in lines if line.strip().startswith(f"railnav {verb}")]
         assert examples
         for example in examples:
-            run(*example[1:])
+            if "postgresql://" not in " ".join(example):  # a server: tests/io/test_postgis.py
+                run(*example[1:])
     for line in next_commands(Path("demo")):
         words = [
             w
