@@ -90,6 +90,7 @@ def test_damaged_or_changed_records_are_refused(stock, tmp_path):
         blob = bytearray(file.execute("SELECT across FROM records").fetchone()[0])
         blob[100] ^= 1
         file.execute("UPDATE records SET across = ?", (bytes(blob),))
+    file.close()
     with pytest.raises(ModelError, match="has changed since"):
         _ = model.records
     with pytest.raises(ModelError, match="damaged"):
