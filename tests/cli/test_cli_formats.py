@@ -95,7 +95,7 @@ def test_moving_features(here: Path) -> None:
 
 
 def test_layers_by_their_columns(here: Path) -> None:
-    pyogrio = pytest.importorskip("pyogrio")
+    import pyogrio
     import shapely
 
     lines = [shapely.LineString([(3_460_000, 5_480_000), (3_460_000, 5_480_500)])]

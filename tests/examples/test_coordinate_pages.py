@@ -16,8 +16,6 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 @pytest.mark.parametrize("page", ["coordinates.md", "stores.md"])
 def test_code_runs(page):
-    if page == "stores.md":
-        pytest.importorskip("geopandas")
     blocks = re.findall(r"```python\n(.*?)```", (DOCS / page).read_text(encoding="utf-8"), re.S)
     assert blocks
     exec(compile("\n".join(blocks), page, "exec"), {})
