@@ -50,7 +50,7 @@ class _Stream(Struct):
 
 
 class _Gnss(_Stream):
-    frame: Annotated[str, Meta(min_length=1)] = "WGS84"
+    frame: Annotated[str, Meta(min_length=1)] | int = "WGS84"
     epoch: Any = None
     fixed_to: str = ""
     plate: str = ""
@@ -436,12 +436,13 @@ def _gnss(table: Table, time: FloatArray, stream: _Gnss, start: datetime, toml: 
     latitude, longitude = np.deg2rad(table.number["latitude_deg"]), np.deg2rad(table.number["longitude_deg"])
     height = _known(table, "height_m")
     epoch = None if stream.epoch is None else _epoch(stream.epoch, toml)
-    if stream.frame != "WGS84" or stream.fixed_to:
+    named = str(stream.frame)  # an EPSG code may stand as a number
+    if named != "WGS84" or stream.fixed_to:
         from railnav.geodesy.transformation import geodetic_frame
 
         try:
             frame = geodetic_frame(
-                stream.frame,
+                named,
                 latitude,
                 longitude,
                 epoch=_decimal_year(start) if epoch is None else epoch,
@@ -467,7 +468,7 @@ def _gnss(table: Table, time: FloatArray, stream: _Gnss, start: datetime, toml: 
         satellites=_known(table, "satellites"),
         hdop=_known(table, "hdop"),
         lever_arm_b=_fixed(stream.lever_arm_m),
-        frame=stream.frame,
+        frame=named,
         epoch=epoch,
         fixed_to=stream.fixed_to,
         receiver=stream.receiver,

@@ -205,7 +205,11 @@ def check_table(table: Table, columns: Sequence[Column]) -> None:
         if column.positive and (wrong := values <= 0).any():
             index = int(np.argmax(wrong))
             cause = f"{values[index]:.12g} is not positive"
-            table.refuse(index, column.name, cause, "leave the cell empty where nothing is known")
+            table.refuse(index, column.name, cause, _way_out(column))
+
+
+def _way_out(column: Column) -> str:
+    return "correct the cell, or remove the row" if column.complete else "leave the cell empty where nothing is known"
 
 
 def header_of(path: Path) -> set[str]:
@@ -275,7 +279,7 @@ def _check_file(path: Path, error: type[InputError]) -> None:
 def _missing(path: Path, name: str, found: Sequence[str], error: type[InputError], hint: str = "") -> InputError:
     listed = ", ".join(found[:20]) + (", ..." if len(found) > 20 else "")
     remedy = hint or f"the file has: {_shown(listed, 300)[1:-1]}"
-    return error("required column is missing", file=path, column=name, remedy=remedy)
+    return error("required column is missing", file=path, row=1, column=name, remedy=remedy)
 
 
 def _shown(text: str, limit: int = 40) -> str:
@@ -402,7 +406,7 @@ def _diagnose(
             for index, name in numbers:
                 if not _NUMBER.fullmatch(cells[index]):
                     comma = "," in cells[index]
-                    remedy = "use a decimal point" if comma else "leave the cell empty where nothing is known"
+                    remedy = "use a decimal point" if comma else _way_out(wanted[name])
                     return error(
                         f"{_shown(cells[index])} is not a number", file=path, row=row, column=name, remedy=remedy
                     )

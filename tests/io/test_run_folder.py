@@ -208,11 +208,11 @@ def test_all_real_runs_read(shared_data):
 TABLES = {
     "missing column": (
         "time_s,latitude_deg\n0,47\n",
-        "gnss.csv, column longitude_deg: required column is missing; the file has: time_s, latitude_deg",
+        "gnss.csv, row 1, column longitude_deg: required column is missing; the file has: time_s, latitude_deg",
     ),
     "semicolons": (
         "time_s;latitude_deg;longitude_deg\n0;47,5;19\n",
-        "gnss.csv, column time_s: required column is missing; fields are separated by semicolons: use commas and a decimal point",
+        "gnss.csv, row 1, column time_s: required column is missing; fields are separated by semicolons: use commas and a decimal point",
     ),
     "column twice": (
         "time_s,latitude_deg,longitude_deg,time_s\n0,47,19,0\n",
@@ -236,7 +236,7 @@ TABLES = {
     ),
     "word": (
         "time_s,latitude_deg,longitude_deg\n0,47,19\n\n1,47,none\n",
-        "gnss.csv, row 4, column longitude_deg: 'none' is not a number; leave the cell empty where nothing is known",
+        "gnss.csv, row 4, column longitude_deg: 'none' is not a number; correct the cell, or remove the row",
     ),
     "decimal comma": (
         'time_s,latitude_deg,longitude_deg\n0,"47,5",19\n',
@@ -360,7 +360,7 @@ def test_parquet_is_refused_with_its_cause(folder):
     pq.write_table(pa.table({"time_s": [0.0, None], "latitude_deg": [0.0, 0], "longitude_deg": [0.0, 1.0]}), target)
     assert "gnss.parquet, row 3, column time_s: is empty or not a number" in refusal(path)
     pq.write_table(pa.table({"time_s": [0.0]}), target)
-    assert "gnss.parquet, column latitude_deg: required column is missing" in refusal(path)
+    assert "gnss.parquet, row 1, column latitude_deg: required column is missing" in refusal(path)
     pq.write_table(pa.table({"time_s": pa.array([], pa.float64())}), target)
     assert "required column is missing" in refusal(path)
     data = target.read_bytes()

@@ -159,7 +159,7 @@ ROW = "0,A,1.5,80,0.0015,1,2,3,47,19,90,10,0,1,0.1,5,0.99,tracking"
 REFUSALS = {
     "missing column": (
         HEADER.replace(",sigma_cross_m", "") + "\n" + ROW.replace(",0.1", ""),
-        r"s.csv, column sigma_cross_m: required column is missing; the file has: time_s, track",
+        r"s.csv, row 1, column sigma_cross_m: required column is missing; the file has: time_s, track",
     ),
     "mode": (
         f"{HEADER}\n{ROW.replace('tracking', 'guessing')}",
