@@ -18,7 +18,7 @@ import numpy as np
 
 from railnav.inertial._kernels import strapdown_kernel
 from railnav.inertial.aided import Fixes, Unknowns, VehicleMotion, integrate
-from railnav.inertial.loose import ImuNoise, InitialSigma
+from railnav.inertial.imu_noise import ImuNoise, InitialSigma
 from railnav.inertial.mechanization import GravityField, NavigationState, mechanize
 
 SCHEMES = ("coning", "matrix", "euler", "predictor", "predictor_first_order")

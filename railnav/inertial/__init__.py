@@ -63,9 +63,10 @@ from railnav.inertial.growth import LegError, leg_error
 from railnav.inertial.heading import VelocityHeading, heading_from_antennas, heading_from_velocity
 from railnav.inertial.imu_calibration import ImuCalibration, Provenance, TriadNoise, TriadTemperature, apply_calibration
 from railnav.inertial.imu_diagnosis import ImuDiagnosis, diagnose_imu
+from railnav.inertial.imu_noise import ImuNoise, InitialSigma
 from railnav.inertial.inspection import Finding, inspect_log
 from railnav.inertial.journey import Journey, autonomous_journey
-from railnav.inertial.loose import ImuNoise, InitialSigma, LooseSolution, integrate_gnss
+from railnav.inertial.loose import LooseSolution, integrate_gnss
 from railnav.inertial.mechanization import (
     EARTH_RATE,
     GravityField,

@@ -1,7 +1,7 @@
 """Byte parsers of GNSS logs: a block of bytes in, rows of numbers out, no validation of arguments.
 
 Each parser is resumable: what it knows between two blocks lies in the arrays `count` and `slot*`. Rows are written in the order
-of `railnav.io.gnss_log.COLUMNS`.
+of `railnav.io.log_reading.COLUMNS`.
 """
 
 from __future__ import annotations

@@ -6,6 +6,7 @@ digit of a log is lost. A stamp within a leap second falls on the second that fo
 
 from __future__ import annotations
 
+import re
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
@@ -30,11 +31,32 @@ LEAP_DAYS = (
     (1981, 7), (1982, 7), (1983, 7), (1985, 7), (1988, 1), (1990, 1), (1991, 1), (1992, 7), (1993, 7),
     (1994, 7), (1996, 1), (1997, 7), (1999, 1), (2006, 1), (2009, 1), (2012, 7), (2015, 7), (2017, 1),
 )  # fmt: skip
+_TIME = re.compile(
+    r"(\d{4})-(\d\d)-(\d\d)T(\d\d):(\d\d):(\d\d)(?:[.,](\d{1,9})\d*)?(Z|[+-]\d\d:?\d\d)?", re.ASCII
+)  # without a zone: UTC, as GPX says
 
 
 def nanoseconds(instant: datetime) -> int:
     """Give an aware instant in ns since 1970, exactly."""
     return (instant.astimezone(UTC) - _EPOCH) // timedelta(microseconds=1) * 1000
+
+
+def instant(text: str) -> int | None:
+    """Give an ISO 8601 instant with its zone (UTC where it names none) in ns since 1970; None if it is none of 1980 to 2199."""
+    match = _TIME.fullmatch(text)
+    if not match:
+        return None
+    year, month, day, hour, minute, second = (int(part) for part in match.groups()[:6])
+    if second > 60 or not 1980 <= year < 2200:
+        return None
+    try:
+        start = nanoseconds(datetime(year, month, day, hour, minute, tzinfo=UTC))
+    except ValueError:
+        return None
+    fraction = int((match[7] or "").ljust(9, "0"))
+    zone = match[8] or "Z"
+    east = 0 if zone == "Z" else (int(zone[1:3]) * 60 + int(zone[-2:])) * (-60 if zone[0] == "-" else 60)
+    return start + (second - east) * SECOND + fraction
 
 
 def calendar(stamp: int) -> str:

@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from railnav.io.gnss_log import COLUMNS, Found, Gathered, Sink, rank
-from railnav.io.gpx import _instant
-from railnav.io.nmea import ORDER
+from railnav.io import gnss_time
+from railnav.io.log_reading import COLUMNS, Found, Gathered, Sink, rank
 
 _ROWS = 1 << 14
 #: A line longer than this is no report.
@@ -61,7 +60,7 @@ def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> 
             stamp=none if stamp is None else stamp,
             number=number,
             row=none if row is None else row,
-            better=lambda: rank(number, ORDER),
+            better=lambda: rank(number),
             good=good,
             broken=broken,
             first_broken=first_broken,
@@ -96,7 +95,7 @@ def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> 
                 continue
             row = _fix(report, sky)
             time = report.get("time")
-            stamp = _instant(time) if isinstance(time, str) else None
+            stamp = gnss_time.instant(time) if isinstance(time, str) else None
             if row is None or stamp is None:
                 broken += 1
                 good -= 1

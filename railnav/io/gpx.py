@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import NoReturn
 from xml.parsers import expat  # document types are refused, so that there are no entities to expand
@@ -18,8 +17,7 @@ import numpy as np
 
 from railnav.errors import RunError
 from railnav.io import gnss_time
-from railnav.io.gnss_log import COLUMNS, Found, Gathered, Sink, rank
-from railnav.io.nmea import ORDER
+from railnav.io.log_reading import COLUMNS, Found, Gathered, Sink, rank
 
 _BLOCK = 1 << 18
 _ROWS = 1 << 14
@@ -29,9 +27,6 @@ _MAX_TEXT = 1000
 _QUALITY = {"none": 0.0, "2d": 1.0, "3d": 1.0, "dgps": 2.0, "pps": 3.0}
 _NUMBERS = {"ele", "geoidheight", "sat", "hdop", "speed", "course"}
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?", re.ASCII)
-_TIME = re.compile(
-    r"(\d{4})-(\d\d)-(\d\d)T(\d\d):(\d\d):(\d\d)(?:[.,](\d{1,9})\d*)?(Z|[+-]\d\d:?\d\d)?", re.ASCII
-)  # without a zone: UTC, as the schema says
 
 
 class _Track:
@@ -147,28 +142,11 @@ class _Track:
         return value
 
     def stamp(self, text: str) -> int:
-        stamp = _instant(text)
+        stamp = gnss_time.instant(text)
         if stamp is None:
             remedy = "write UTC, as in 2021-06-29T10:35:17.25Z"
             self.refuse(f"{text[:40]!r} is no instant", column="time", remedy=remedy)
         return stamp
-
-
-def _instant(text: str) -> int | None:
-    match = _TIME.fullmatch(text)
-    if not match:
-        return None
-    year, month, day, hour, minute, second = (int(part) for part in match.groups()[:6])
-    if second > 60 or not 1980 <= year < 2200:
-        return None
-    try:
-        start = gnss_time.nanoseconds(datetime(year, month, day, hour, minute, tzinfo=UTC))
-    except ValueError:
-        return None
-    fraction = int((match[7] or "").ljust(9, "0"))
-    zone = match[8] or "Z"
-    east = 0 if zone == "Z" else (int(zone[1:3]) * 60 + int(zone[-2:])) * (-60 if zone[0] == "-" else 60)
-    return start + (second - east) * gnss_time.SECOND + fraction
 
 
 def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> Found:  # noqa: ARG001 - the points state their dates
@@ -217,7 +195,7 @@ def _found(track: _Track) -> Found:
         stamp=none if stamp is None else stamp,
         number=number,
         row=none if row is None else row,
-        better=lambda: rank(number, ORDER),
+        better=lambda: rank(number),
         good=track.count,
         void=track.void,
         counts={"trkpt": track.count},

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railnav.io import gnss_time
-from railnav.io.gnss_log import COLUMNS
+from railnav.io.log_reading import COLUMNS
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -49,7 +49,7 @@ class Writer:
         return [f"{count} fixes {why} left out" for why, count in self.left_out.items() if count]
 
     def add(self, stamp: IntArray, columns: Mapping[str, FloatArray]) -> None:
-        """Write fixes: stamps, ns since 1970 UTC, and columns of `railnav.io.gnss_log.COLUMNS`."""
+        """Write fixes: stamps, ns since 1970 UTC, and columns of `railnav.io.log_reading.COLUMNS`."""
         table = {name: columns[name].tolist() if name in columns else None for name in COLUMNS}
         self.fixes += len(stamp)
         self.rows(stamp, table)
@@ -210,7 +210,7 @@ class CsvWriter(Writer):
         self.file.write(",".join(["time_s", *COLUMNS]) + "\n")
 
     def add(self, stamp: IntArray, columns: Mapping[str, FloatArray]) -> None:
-        """Write fixes: stamps, ns since 1970 UTC, and columns of `railnav.io.gnss_log.COLUMNS`."""
+        """Write fixes: stamps, ns since 1970 UTC, and columns of `railnav.io.log_reading.COLUMNS`."""
         import pyarrow as pa
         from pyarrow import csv as arrow_csv
 

@@ -16,12 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from railnav.io import _kernels, gnss_time
-from railnav.io.gnss_log import BLOCK, COLUMNS, NO_DATE, ByteArray, Found, Gathered, IntArray, Sink, rank, through
+from railnav.io.log_reading import BLOCK, COLUMNS, NO_DATE, ByteArray, Found, Gathered, IntArray, Sink, rank, through
 
 #: Sentences that are used, in the order of their counters.
 SENTENCES = ("GGA", "GNS", "RMC", "GLL", "GST", "VTG", "ZDA", "other")
-#: Kinds of fix (GGA quality), larger is better: RTK, float, differential, single, dead reckoning.
-ORDER = {4: 6, 5: 5, 2: 4, 3: 4, 9: 4, 1: 3, 6: 2, 7: 1, 8: 1}
 
 _CHECKED = re.compile(rb"\$[A-Z0-9]{3,5},[^\r\n$*]*\*[0-9A-Fa-f]{2}")
 _SHORTEST = 24  # bytes of a sentence that can open an epoch
@@ -60,7 +58,7 @@ def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> 
             stamp=of_day,
             number=number,
             row=row,
-            better=lambda: rank(number, ORDER),
+            better=lambda: rank(number),
             good=int(count[_kernels.GOOD]),
             broken=int(count[_kernels.BROKEN]),
             first_broken=int(count[_kernels.FIRST_BROKEN]) if count[_kernels.BROKEN] else None,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from railnav.errors import RunError
 from railnav.io import _kernels, gnss_time
-from railnav.io.gnss_log import BLOCK, COLUMNS, ByteArray, Found, Gathered, IntArray, Sink, rank, through
+from railnav.io.log_reading import BLOCK, COLUMNS, ByteArray, Found, Gathered, IntArray, Sink, rank, through
 
 #: Kinds of fix (Q), larger is better.
 ORDER = {1: 6, 2: 5, 6: 4, 4: 3, 3: 2, 5: 1}
@@ -81,7 +81,7 @@ def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> 
             stamp=stamped - _JST if names[0] == "JST" else stamped,
             number=number,
             row=row,
-            better=lambda: rank(number, ORDER),
+            better=lambda: rank(number),
             gps_time=names[0] == "GPST",
             good=int(count[_kernels.GOOD]),
             broken=int(count[_kernels.BROKEN]),

@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from railnav.io import _kernels
-from railnav.io.gnss_log import BLOCK, COLUMNS, ByteArray, Found, Gathered, IntArray, Sink, rank, through
-from railnav.io.nmea import ORDER
+from railnav.io.log_reading import BLOCK, COLUMNS, ByteArray, Found, Gathered, IntArray, Sink, rank, through
 
 #: Names of messages that a log without NAV-PVT is likely to hold.
 MESSAGES = {
@@ -69,7 +68,7 @@ def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> 
             stamp=stamped,
             number=number,
             row=byte,
-            better=lambda: rank({name: number[name] for name in number if name != "satellites"}, ORDER),
+            better=lambda: rank({name: number[name] for name in number if name != "satellites"}),
             good=int(count[_kernels.GOOD]),
             broken=int(count[_kernels.BROKEN]),
             first_broken=int(count[_kernels.FIRST_BROKEN]) if count[_kernels.BROKEN] else None,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from railnav.errors import RunError
 from railnav.io import _ubx_kernels, gnss_time
-from railnav.io.gnss_log import ByteArray, through
+from railnav.io.log_reading import ByteArray, through
 from railnav.io.tables import Table, _check_file, freeze
 from railnav.run import ImuStream, OdometerStream
 

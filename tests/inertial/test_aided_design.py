@@ -14,7 +14,7 @@ from railnav.inertial.aided.aiding import Fixes, Ranges, Rests, VehicleMotion
 from railnav.inertial.aided.integration import integrate
 from railnav.inertial.aided.unknowns import Unknowns, Vehicle
 from railnav.inertial.error_model import error_dynamics, position_scale
-from railnav.inertial.loose import ImuNoise, InitialSigma
+from railnav.inertial.imu_noise import ImuNoise, InitialSigma
 from railnav.inertial.mechanization import GravityField, NavigationState, mechanize
 
 FIELD = GravityField().flat()

@@ -12,7 +12,7 @@ from railnav.inertial.aided.aiding import Fixes, Rests, VehicleMotion, find_rest
 from railnav.inertial.aided.integration import integrate
 from railnav.inertial.aided.unknowns import Unknowns, Vehicle
 from railnav.inertial.error_model import position_scale
-from railnav.inertial.loose import ImuNoise, InitialSigma
+from railnav.inertial.imu_noise import ImuNoise, InitialSigma
 from railnav.inertial.mechanization import GravityField, NavigationState
 from railnav.simulation.road import road_drive
 

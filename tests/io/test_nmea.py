@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from railnav.errors import RailnavError, RunError
-from railnav.io import gnss_log, gnss_time
+from railnav.io import gnss_time, log_reading
 from railnav.io.gnss_log import read_log
 from railnav.io.run import read_run
 
@@ -285,7 +285,7 @@ def some(count):
 def test_blocks_change_nothing(log, monkeypatch, size):
     lines = some(300)
     whole = log(*lines)
-    monkeypatch.setattr(gnss_log, "BLOCK", size)
+    monkeypatch.setattr(log_reading, "BLOCK", size)
     monkeypatch.setattr("railnav.io.nmea.BLOCK", size)
     pieces = log(*lines)
     assert pieces.summary == whole.summary

@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from railnav.errors import RailnavError, RunError
-from railnav.io import gnss_log
+from railnav.io import log_reading
 from railnav.io.gnss_log import read_log
 from railnav.io.run import read_run
 
@@ -169,7 +169,7 @@ def test_refusals(log, name):
 def test_blocks_change_nothing(log, monkeypatch, size):
     parts = [HEAD, *rows(200), "8" * 9000 + "\n", row("2013/06/19 10:09:00")]
     whole = log(*parts)
-    monkeypatch.setattr(gnss_log, "BLOCK", size)
+    monkeypatch.setattr(log_reading, "BLOCK", size)
     monkeypatch.setattr("railnav.io.rtklib.BLOCK", size)
     pieces = log(*parts)
     assert pieces.summary == whole.summary

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pyubx2 import GET, UBXMessage, UBXReader
 
 from railnav.errors import RailnavError, RunError
-from railnav.io import gnss_log
+from railnav.io import log_reading
 from railnav.io.gnss_log import read_log
 from railnav.io.run import read_run
 
@@ -268,7 +268,7 @@ def test_blocks_change_nothing(log, monkeypatch):
     messages.insert(-8, pvt(399)[:50] + b"x")  # broken, far behind the first block
     whole = log(*messages)
     for size in (65_600, 70_003):
-        monkeypatch.setattr(gnss_log, "BLOCK", size)
+        monkeypatch.setattr(log_reading, "BLOCK", size)
         monkeypatch.setattr("railnav.io.ubx.BLOCK", size)
         monkeypatch.setattr("railnav.io.ubx._ROOM", 50)
         pieces = log(*messages)

@@ -19,7 +19,7 @@ from railnav.inertial.aided import layout as k
 from railnav.inertial.aided.aiding import Fixes, Ranges, Rests, VehicleMotion
 from railnav.inertial.aided.unknowns import Unknowns, Vehicle, menu
 from railnav.inertial.error_model import position_scale
-from railnav.inertial.loose import ImuNoise, InitialSigma
+from railnav.inertial.imu_noise import ImuNoise, InitialSigma
 from railnav.inertial.mechanization import GravityField, NavigationState, Trajectory
 
 FloatArray = NDArray[np.float64]

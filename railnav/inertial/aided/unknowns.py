@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railnav.inertial.aided import layout as k
-from railnav.inertial.loose import ImuNoise, InitialSigma
+from railnav.inertial.imu_noise import ImuNoise, InitialSigma
 
 FloatArray = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from railnav.errors import EstimationError
 from railnav.inertial.aided import AidedSolution, Rests, Unknowns, Vehicle, VehicleMotion, integrate
 from railnav.inertial.aided.fusion import fuse
 from railnav.inertial.error_model import position_scale
-from railnav.inertial.loose import InitialSigma
+from railnav.inertial.imu_noise import InitialSigma
 from railnav.inertial.mechanization import Trajectory
 from railnav.navigation.schemes.streams import InertialSettings
 

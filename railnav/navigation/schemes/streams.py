@@ -12,7 +12,7 @@ from railnav.attitude import dcm_from_euler
 from railnav.errors import RunError
 from railnav.inertial.aided import Fixes, Rests, VehicleMotion, find_rests
 from railnav.inertial.error_model import position_scale
-from railnav.inertial.loose import ImuNoise, InitialSigma
+from railnav.inertial.imu_noise import ImuNoise, InitialSigma
 from railnav.inertial.mechanization import NavigationState
 from railnav.navigation.epochs import body_from_imu
 from railnav.run import GnssStream, OdometerStream, Run
