@@ -68,11 +68,11 @@ class Found:
 Sink = Callable[["Found"], None]
 
 
-def rank(number: Mapping[str, FloatArray]) -> FloatArray:
-    """Order fixes of one instant: by kind of fix (`QUALITY_ORDER`), satellites, smaller HDOP, smaller sigma."""
+def rank(number: Mapping[str, FloatArray], order: Mapping[int, int] = QUALITY_ORDER) -> FloatArray:
+    """Order fixes of one instant: by kind of fix (`order` of the quality), satellites, smaller HDOP, smaller sigma."""
     better = np.zeros(len(number["latitude_deg"]))
     if "quality" in number:
-        for value, place in QUALITY_ORDER.items():
+        for value, place in order.items():
             better[number["quality"] == value] = place * 1e9
     for name, weight, unknown, limit in (
         ("satellites", 1e6, 0.0, 999.0),

@@ -81,7 +81,7 @@ def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> 
             stamp=stamped - _JST if names[0] == "JST" else stamped,
             number=number,
             row=row,
-            better=lambda: rank(number),
+            better=lambda: rank(number, ORDER),
             gps_time=names[0] == "GPST",
             good=int(count[_kernels.GOOD]),
             broken=int(count[_kernels.BROKEN]),
