@@ -182,11 +182,12 @@ def _inside(profile: Gradients, i: int, a: float, b: float) -> tuple[FloatArray,
 
 
 def _read_landxml(path: Path, crs: str) -> tuple[Design, ...]:
-    from railnav.io.landxml import _direction_unit, _document, _read_alignment
+    from railnav.io.landxml import read_alignment
+    from railnav.io.landxml_document import direction_unit, document
     from railnav.io.xml_document import local_name as _local
 
-    root = _document(path)
-    unit = _direction_unit(root, path)
+    root = document(path)
+    unit = direction_unit(root, path)
     for node in root:
         if not crs and _local(node) == "CoordinateSystem":
             code = str(node.get("epsgCode", "")).removeprefix("EPSG:")
@@ -195,7 +196,7 @@ def _read_landxml(path: Path, crs: str) -> tuple[Design, ...]:
     designs: list[Design] = []
     for node in root.iter():
         if _local(node) == "Alignment":
-            a = _read_alignment(path, node, unit, notes)
+            a = read_alignment(path, node, unit, notes)
             designs.append(Design(a.name, a.plan, start=a.start, profile=a.profile, cant=a.cant, crs=crs))
     if not designs:
         raise InputError("has no Alignment", file=path, remedy="export the track's alignments, with CoordGeom")

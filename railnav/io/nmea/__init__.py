@@ -15,8 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from railnav.io import _kernels, gnss_time
+from railnav.io import _kernels as shared
+from railnav.io import gnss_time
 from railnav.io.log_reading import BLOCK, COLUMNS, NO_DATE, ByteArray, Found, Gathered, IntArray, Sink, rank, through
+from railnav.io.nmea import _kernels
 
 #: Sentences that are used, in the order of their counters.
 SENTENCES = ("GGA", "GNS", "RMC", "GLL", "GST", "VTG", "ZDA", "other")
@@ -36,9 +38,9 @@ def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> 
     """
     count = np.zeros(_kernels.NMEA_COUNTERS, dtype=np.int64)
     count[_kernels.LAST_DAY] = count[_kernels.CURRENT] = -1
-    slot = np.zeros((_kernels.SLOTS, _kernels.S_INTEGERS), dtype=np.int64)
-    slot_row = np.full((_kernels.SLOTS, _kernels.S_NUMBERS), np.nan)
-    out = np.empty((BLOCK // _SHORTEST // 4, _kernels.WIDTH))
+    slot = np.zeros((shared.SLOTS, _kernels.S_INTEGERS), dtype=np.int64)
+    slot_row = np.full((shared.SLOTS, _kernels.S_NUMBERS), np.nan)
+    out = np.empty((BLOCK // _SHORTEST // 4, shared.WIDTH))
     stamp = np.empty((len(out), 3), dtype=np.int64)
     numbers, stamps = Gathered(COLUMNS), Gathered(("time", "day", "row"))
     checked = _has_checksums(path)
@@ -59,12 +61,12 @@ def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> 
             number=number,
             row=row,
             better=lambda: rank(number),
-            good=int(count[_kernels.GOOD]),
-            broken=int(count[_kernels.BROKEN]),
-            first_broken=int(count[_kernels.FIRST_BROKEN]) if count[_kernels.BROKEN] else None,
-            void=int(count[_kernels.VOID]),
-            duplicates=int(count[_kernels.DUPLICATES]),
-            counts={name: int(count[_kernels.KINDS + k]) for k, name in enumerate(SENTENCES)},
+            good=int(count[shared.GOOD]),
+            broken=int(count[shared.BROKEN]),
+            first_broken=int(count[shared.FIRST_BROKEN]) if count[shared.BROKEN] else None,
+            void=int(count[shared.VOID]),
+            duplicates=int(count[shared.DUPLICATES]),
+            counts={name: int(count[shared.KINDS + k]) for k, name in enumerate(SENTENCES)},
         )
         if len(of_day):
             before = len(clock)
@@ -85,7 +87,7 @@ def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> 
             used += int(more)
             if sink is not None and numbers.length >= part:
                 sink(found())
-            if rows < len(out) - _kernels.SLOTS:
+            if rows < len(out) - shared.SLOTS:
                 return used
 
     through(path, step)

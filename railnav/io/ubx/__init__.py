@@ -13,8 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from railnav.io import _kernels
+from railnav.io import _kernels as shared
 from railnav.io.log_reading import BLOCK, COLUMNS, ByteArray, Found, Gathered, IntArray, Sink, rank, through
+from railnav.io.ubx import _kernels
 
 #: Names of messages that a log without NAV-PVT is likely to hold.
 MESSAGES = {
@@ -48,10 +49,10 @@ def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> 
     """
     count = np.zeros(_kernels.UBX_COUNTERS, dtype=np.int64)
     kinds = np.zeros(1 << 16, dtype=np.int64)
-    slot = np.zeros((_kernels.SLOTS, _kernels.U_INTEGERS), dtype=np.int64)
-    slot_row = np.full((_kernels.SLOTS, _kernels.U_NUMBERS), np.nan)
+    slot = np.zeros((shared.SLOTS, _kernels.U_INTEGERS), dtype=np.int64)
+    slot_row = np.full((shared.SLOTS, _kernels.U_NUMBERS), np.nan)
     sums = np.empty((2, BLOCK + 1), dtype=np.uint8)
-    out = np.empty((_ROOM, _kernels.WIDTH))
+    out = np.empty((_ROOM, shared.WIDTH))
     stamp = np.empty((_ROOM, 2), dtype=np.int64)
     numbers, stamps = Gathered(COLUMNS), Gathered(("stamp", "byte"))
 
@@ -69,11 +70,11 @@ def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> 
             number=number,
             row=byte,
             better=lambda: rank({name: number[name] for name in number if name != "satellites"}),
-            good=int(count[_kernels.GOOD]),
-            broken=int(count[_kernels.BROKEN]),
-            first_broken=int(count[_kernels.FIRST_BROKEN]) if count[_kernels.BROKEN] else None,
-            void=int(count[_kernels.VOID]),
-            duplicates=int(count[_kernels.DUPLICATES]),
+            good=int(count[shared.GOOD]),
+            broken=int(count[shared.BROKEN]),
+            first_broken=int(count[shared.FIRST_BROKEN]) if count[shared.BROKEN] else None,
+            void=int(count[shared.VOID]),
+            duplicates=int(count[shared.DUPLICATES]),
             counts={_name(int(kind)): int(kinds[kind]) for kind in np.flatnonzero(kinds)},
         )
 
@@ -86,7 +87,7 @@ def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> 
             used += int(more)
             if sink is not None and numbers.length >= part:
                 sink(found())
-            if rows < _ROOM - _kernels.SLOTS:
+            if rows < _ROOM - shared.SLOTS:
                 return used
 
     through(path, step)

@@ -13,21 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railnav.errors import RunError
-from railnav.io import _kernels, gnss_time
+from railnav.io import _kernels as shared
+from railnav.io import gnss_time
 from railnav.io.log_reading import BLOCK, COLUMNS, ByteArray, Found, Gathered, IntArray, Sink, rank, through
+from railnav.io.rtklib import _kernels
 
 #: Kinds of fix (Q), larger is better.
 ORDER = {1: 6, 2: 5, 6: 4, 4: 3, 3: 2, 5: 1}
 
 _MEANING = {
-    "latitude(deg)": _kernels.LAT,
-    "longitude(deg)": _kernels.LON,
-    "height(m)": _kernels.HEIGHT,
-    "Q": _kernels.QUALITY,
-    "ns": _kernels.SATELLITES,
-    "sdn": _kernels.SIGMA_N,
-    "sde": _kernels.SIGMA_E,
-    "sdu": _kernels.SIGMA_U,
+    "latitude(deg)": shared.LAT,
+    "longitude(deg)": shared.LON,
+    "height(m)": shared.HEIGHT,
+    "Q": shared.QUALITY,
+    "ns": shared.SATELLITES,
+    "sdn": shared.SIGMA_N,
+    "sde": shared.SIGMA_E,
+    "sdu": shared.SIGMA_U,
     "vn": _kernels.P_NORTH,
     "ve": _kernels.P_EAST,
     "sdvn": _kernels.P_SIGMA_NORTH,
@@ -62,7 +64,7 @@ def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> 
         plain = name if name in _REQUIRED or name == "height(m)" else name.partition("(")[0]
         meaning[place] = _MEANING.get(plain, -1)
     if not height:
-        meaning[meaning == _kernels.HEIGHT] = -1
+        meaning[meaning == shared.HEIGHT] = -1
     count = np.zeros(_kernels.POS_COUNTERS, dtype=np.int64)
     out = np.empty((BLOCK // _SHORTEST // 4, _kernels.P_NUMBERS))
     stamp = np.empty((len(out), 2), dtype=np.int64)
@@ -83,11 +85,11 @@ def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> 
             row=row,
             better=lambda: rank(number, ORDER),
             gps_time=names[0] == "GPST",
-            good=int(count[_kernels.GOOD]),
-            broken=int(count[_kernels.BROKEN]),
-            first_broken=int(count[_kernels.FIRST_BROKEN]) if count[_kernels.BROKEN] else None,
-            void=int(count[_kernels.VOID]),
-            counts={"rows": int(count[_kernels.GOOD])},
+            good=int(count[shared.GOOD]),
+            broken=int(count[shared.BROKEN]),
+            first_broken=int(count[shared.FIRST_BROKEN]) if count[shared.BROKEN] else None,
+            void=int(count[shared.VOID]),
+            counts={"rows": int(count[shared.GOOD])},
         )
 
     def step(data: ByteArray, last: bool) -> int:
@@ -100,7 +102,7 @@ def scan(path: Path, start: int, *, sink: Sink | None = None, part: int = 0) -> 
         used = 0
         while True:
             more, rows = _kernels.pos_block(data[used:], last, meaning, count, out, stamp)
-            numbers.add(out[:rows, : _kernels.WIDTH])
+            numbers.add(out[:rows, : shared.WIDTH])
             stamps.add(stamp[:rows])
             used += int(more)
             if sink is not None and numbers.length >= part:
