@@ -12,6 +12,7 @@ from railnav.cli._verb import PATH, json_option
 if TYPE_CHECKING:
     from railnav.monitoring.limits import Exceedance
     from railnav.monitoring.monitor import Report
+    from railnav.monitoring.quality import Segment
 
 TABLE_ENDINGS = (".csv", ".parquet")
 #: Exceedances shown in the terminal.
@@ -33,6 +34,7 @@ def _default_limits(ctx: click.Context, _: click.Parameter, value: bool) -> None
 @click.option("-o", "--output", type=PATH, required=True, help="Page to write, .html.")
 @click.option("--channels", type=PATH, help="Also write all channels: .csv or .parquet.")
 @click.option("--exceedances", "list_file", type=PATH, help="Also write the exceedances of all runs: .csv or .parquet.")
+@click.option("--quality", type=PATH, help="Also write standard deviations and classes over 200 m: .csv or .parquet.")
 @click.option("--limits", type=PATH, help="Table of limits, .toml.  [default: standard gauge; see --default-limits]")
 @click.option(
     "--default-limits",
@@ -84,6 +86,7 @@ def command(
     output: Path,
     channels: Path | None,
     list_file: Path | None,
+    quality: Path | None,
     limits: Path | None,
     tracks: str | None,
     speed: float | None,
@@ -96,9 +99,9 @@ def command(
 ) -> None:
     """Work out track geometry channels from runs on a model, and hold them against limits.
 
-    Longitudinal level and alignment in D1, D2 and D3, cross level, twist, gauge and curvature, each from the streams that a RUN has; the
-    page says which bands its sensors can bear and which not. Several runs are laid over each other to the decimetre or better; runs of
-    several dates give growth per month.
+    Longitudinal level and alignment of axis and rails in D0 to D3, cross level, twist, gauge and curvature, each from the streams that a
+    RUN has; the page says which bands its sensors can bear and which not. Several runs are laid over each other to the decimetre or better;
+    runs of several dates give growth per month.
 
     \b
     Example:
@@ -109,14 +112,13 @@ def command(
 
     inputs = [model, *([limits] if limits else []), *(member for run in runs for member in _files.members(run))]
     _files.check_output(output, _files.PAGE_ENDINGS, inputs=inputs)
-    taken = [*inputs, output]
-    for extra in (channels, list_file):
+    taken = [output]
+    for extra in (channels, list_file, quality):
         if extra is not None:
-            _files.check_output(extra, TABLE_ENDINGS, inputs=taken)
-            if extra.resolve() in [
-                path.resolve() for path in (output, *([channels] if extra is list_file and channels else []))
-            ]:
+            _files.check_output(extra, TABLE_ENDINGS, inputs=inputs)
+            if extra.resolve() in [path.resolve() for path in taken]:
                 raise click.UsageError(f"{extra} is named twice")
+            taken.append(extra)
     _files.need_report()
     from railnav.io.imu_calibration import calibrated_run
     from railnav.io.limits import default_limits, read_limits
@@ -153,10 +155,22 @@ def command(
         from railnav.io.geometry import write_exceedances
 
         write_exceedances(found, list_file)
+    if quality is not None:
+        from railnav.io.geometry import write_quality
+
+        write_quality(report, quality)
     _files.write_text(output, page)
-    written = [path for path in (output, channels, list_file) if path is not None]
+    written = taken
     if as_json:
-        print_json({**facts(report), "output": output, "channels": channels, "exceedances_file": list_file})
+        print_json(
+            {
+                **facts(report),
+                "output": output,
+                "channels": channels,
+                "exceedances_file": list_file,
+                "quality_file": quality,
+            }
+        )
         return
     print_warnings(report.notes)
     _print(report, found, written)
@@ -206,6 +220,10 @@ def facts(report: Report) -> dict[str, Any]:
                     }
                     for e in part.exceedances
                 ],
+                "quality_mm": {
+                    g.recording.run.id: _quality(graded)
+                    for g, graded in zip(part.geometries, part.segments, strict=True)
+                },
                 "trends": {
                     t.channel: {
                         "significant": int(t.growth.significant.sum()),
@@ -218,6 +236,19 @@ def facts(report: Report) -> dict[str, Any]:
             for part in report.sections
         ],
     }
+
+
+def _quality(graded: tuple[Segment, ...]) -> dict[str, dict[str, Any]]:
+    """Standard deviations over 200 m by channel: how many, median, largest, mm, and how many segments a class."""
+    from statistics import median
+
+    found: dict[str, dict[str, Any]] = {}
+    for key in dict.fromkeys(s.channel for s in graded):
+        mine = [s for s in graded if s.channel == key]
+        values = [1e3 * s.deviation for s in mine]
+        classes = {letter: sum(s.grade == letter for s in mine) for letter in sorted({s.grade for s in mine} - {""})}
+        found[key] = {"segments": len(mine), "median": median(values), "largest": max(values), "classes": classes}
+    return found
 
 
 def _print(report: Report, found: list[Exceedance], written: list[Path]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -11,6 +11,7 @@ from railnav.cli._verb import PATH, json_option
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from datetime import datetime
 
     from railnav.track.model import Route, TrackModel
 
@@ -27,11 +28,30 @@ if TYPE_CHECKING:
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Same seed, same run.")
 @click.option(
     "--grade",
-    type=click.Choice(["survey", "service", "phone", "mems", "tactical"]),
+    type=click.Choice(["survey", "service", "phone", "mems", "tactical", "geometry"]),
     default="service",
     show_default=True,
-    help="Sensors: survey car (2 cm GNSS), train in service (GNSS, IMU, odometer), telephone, or a train with an IMU of a data "
-    "sheet, low-cost or tactical.",
+    help="Sensors: survey car (2 cm GNSS), train in service (GNSS, IMU, odometer), telephone, a train with an IMU of a data "
+    "sheet, low-cost or tactical, or a track recording car (angles, gauge and cant at 200 Hz) over irregular track.",
+)
+@click.option(
+    "--irregular",
+    "roughness",
+    metavar="TIMES",
+    type=click.FloatRange(0, 20),
+    help="Irregularities of the track, times those of a fair main line; 0 for none.  [default: 1 with --grade geometry, else 0]",
+)
+@click.option(
+    "--track-seed",
+    type=click.IntRange(min=0),
+    default=1,
+    show_default=True,
+    help="Same track seed, same irregularities, whatever runs over them.",
+)
+@click.option(
+    "--start",
+    type=click.DateTime(["%Y-%m-%d", "%Y-%m-%dT%H:%M:%S"]),
+    help="When the run begins, UTC, e.g. 2026-03-01.  [default: a day in January 2026]",
 )
 @click.option(
     "--imu",
@@ -67,6 +87,9 @@ def command(
     route: str | None,
     seed: int,
     grade: str,
+    roughness: float | None,
+    track_seed: int,
+    start: datetime | None,
     imu: str | None,
     balises: bool,
     top_speed: float,
@@ -80,10 +103,12 @@ def command(
     simulated: they show what the program does, not what a real line is like.
 
     \b
-    Example:
+    Examples:
       railnav simulate -m demo/bundled.gpkg -o run --route 77R-01,77R-13 --seed 7
+      railnav simulate -m demo/bundled.gpkg -o car --grade geometry --route 77R-03 --start 2026-03-01
     """  # noqa: D301
     from dataclasses import replace
+    from datetime import UTC
 
     from railnav.cli import _files
     from railnav.cli._describe import describe_run, print_run
@@ -95,24 +120,29 @@ def command(
     _files.check_output_folder(output)
     from railnav.io.run import write_run
     from railnav.simulation import BaliseSensor, Driving, outfit_of, simulate, with_fault
+    from railnav.simulation.irregularities import GEOMETRY, irregular, simulate_geometry
 
     reference = _files.read_model(model)
     names = _names(route) if route is not None else ()
     if route is not None and not names:
         raise RailnavError("--route names no track")
-    outfit = outfit_of(grade, imu=imu)
+    if grade == GEOMETRY.name and imu is not None:
+        raise click.UsageError("a recording car (--grade geometry) measures angles, not rates: leave --imu out")
+    outfit = GEOMETRY if grade == GEOMETRY.name else outfit_of(grade, imu=imu)
+    rough = roughness if roughness is not None else float(grade == GEOMETRY.name)
     tracks = _way(reference, names) if names else _longest(reference)
     with progress() as tell:
-        run, truth = simulate(
-            reference,
-            tracks,
-            seed=seed,
-            outfit=replace(outfit, balise=BaliseSensor()) if balises else outfit,
-            driving=Driving(speed=top_speed / 3.6),
-            outages=outages,
-            run_id=output.resolve().name,
-            progress=tell,
-        )
+        carried = replace(outfit, balise=BaliseSensor()) if balises else outfit
+        driving = Driving(speed=top_speed / 3.6)
+        more: dict[str, Any] = {"start": start.replace(tzinfo=UTC)} if start is not None else {}
+        more |= {"outages": outages, "run_id": output.resolve().name, "progress": tell}
+        if rough > 0.0:
+            fields = irregular(reference, seed=track_seed, times=rough, tracks=tracks)
+            run, truth = simulate_geometry(
+                reference, tracks, fields, seed=seed, outfit=carried, driving=driving, **more
+            )
+        else:
+            run, truth = simulate(reference, tracks, seed=seed, outfit=carried, driving=driving, **more)
     for name, onset in faults:
         run = with_fault(run, name, start=onset, seed=seed)
     write_run(run, output, truth=truth)
@@ -124,6 +154,8 @@ def command(
                 "route": tracks,
                 "seed": seed,
                 "grade": grade,
+                "irregular": rough,
+                "track_seed": track_seed if rough else None,
                 "faults": list(fault),
                 "simulated": True,
                 "output": output,

@@ -1,4 +1,4 @@
-"""Tables of track geometry: channels along the line and exceedances, CSV or Parquet."""
+"""Tables of track geometry: channels along the line, exceedances, and quality over 200 m, CSV or Parquet."""
 
 from __future__ import annotations
 
@@ -119,3 +119,47 @@ def write_exceedances(found: Sequence[Exceedance], path: str | Path) -> None:
     }
     with atomic_path(path) as draft:
         write_table(draft, table, decimals=decimals)
+
+
+def write_quality(report: Report, path: str | Path) -> int:
+    """Write standard deviations over segments of 200 m, one row a channel, segment and run.
+
+    Columns: `run, section, channel, track, from_m, to_m, chainage_km` (of the middle), `deviation_mm, alert_mm, class`.
+
+    Parameters
+    ----------
+    report : Report
+    path : path
+        .csv or .parquet; replaced whole or not at all.
+
+    Returns
+    -------
+    int
+        Rows written.
+    """
+    rows = [
+        (geometry.recording.run.id, part.section.name, segment)
+        for part in report.sections
+        for geometry, graded in zip(part.geometries, part.segments, strict=True)
+        for segment in graded
+    ]
+
+    def numbers(name: str, factor: float = 1.0) -> FloatArray:
+        return np.array([factor * float(getattr(segment, name)) for _, _, segment in rows], float)
+
+    table: dict[str, FloatArray | Words] = {
+        "run": Words.of(run for run, _, _ in rows),
+        "section": Words.of(section for _, section, _ in rows),
+        "channel": Words.of(segment.channel for _, _, segment in rows),
+        "track": Words.of(segment.track for _, _, segment in rows),
+        "from_m": numbers("start"),
+        "to_m": numbers("finish"),
+        "chainage_km": numbers("chainage", 1e-3),
+        "deviation_mm": numbers("deviation", 1e3),
+        "alert_mm": numbers("alert", 1e3),
+        "class": Words.of(segment.grade for _, _, segment in rows),
+    }
+    decimals = {"from_m": 1, "to_m": 1, "chainage_km": 5, "deviation_mm": 4, "alert_mm": 3}
+    with atomic_path(path) as draft:
+        write_table(draft, table, decimals=decimals)
+    return len(rows)

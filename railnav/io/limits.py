@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from railnav.errors import InputError
-from railnav.monitoring.limits import CLASSES, LEVELS, ClassLimit, Limit, LimitTable
+from railnav.monitoring.limits import CLASSES, LEVELS, ClassLimit, Combination, Limit, LimitTable
+from railnav.monitoring.quality import COMBINABLE
 
 #: The table used when none is named.
 DEFAULT = "limits_1435.toml"
@@ -43,7 +44,7 @@ def read_limits(path: str | Path) -> LimitTable:
     Parameters
     ----------
     path : path
-        TOML: `[table]` with name and gauge_mm, then `[[limit]]`, `[[deviation]]` and `[[class]]`; see the default table.
+        TOML: `[table]` with name and gauge_mm, then `[[limit]]`, `[[deviation]]`, `[[class]]` and `[combined]`; see the default table.
 
     Returns
     -------
@@ -68,12 +69,12 @@ def read_limits(path: str | Path) -> LimitTable:
 
 
 def _table(content: dict[str, Any], file: str | Path) -> LimitTable:
-    unknown = set(content) - {"table", "limit", "deviation", "class"}
+    unknown = set(content) - {"table", "limit", "deviation", "class", "combined"}
     if unknown:
         raise InputError(
             f"unknown table [{sorted(unknown)[0]}]",
             file=file,
-            remedy="use [table], [[limit]], [[deviation]], [[class]]",
+            remedy="use [table], [[limit]], [[deviation]], [[class]], [combined]",
         )
     head = content.get("table", {})
     if not isinstance(head, dict):
@@ -92,7 +93,29 @@ def _table(content: dict[str, Any], file: str | Path) -> LimitTable:
     classes = tuple(_class(row, file, f"class {i + 1}") for i, row in enumerate(entries["class"]))
     if not limits and not deviations and not classes:
         raise InputError("holds no limit", file=file, remedy="add [[limit]] entries; see the default table")
-    return LimitTable(str(head.get("name", file)), gauge / 1e3, limits, deviations, classes)
+    combined = _combined(content["combined"], file) if "combined" in content else None
+    return LimitTable(str(head.get("name", file)), gauge / 1e3, limits, deviations, classes, combined)
+
+
+def _combined(row: Any, file: str | Path) -> Combination:
+    """Weights of the combined standard deviation."""
+    if not isinstance(row, dict):
+        raise InputError("[combined] is not a table", file=file)
+    status, source = _origin(row, file, "combined")
+    weights: dict[str, float] = {}
+    for key, value in row.items():
+        if key in ("status", "source", "note"):
+            continue
+        if key not in COMBINABLE:
+            raise InputError(
+                f"unknown key {key!r}", file=file, column="combined", remedy=f"weigh {', '.join(COMBINABLE)}"
+            )
+        if not _number(value) or not 0.0 <= value <= 1e3:
+            raise InputError(f"{value!r} is no weight", file=file, column=f"combined.{key}", remedy="0 to 1000")
+        weights[key] = float(value)
+    if not any(weights.values()):
+        raise InputError("weighs nothing", file=file, column="combined", remedy=f"weigh {', '.join(COMBINABLE)}")
+    return Combination(weights, status, source)
 
 
 def _limit(row: dict[str, Any], file: str | Path, where: str) -> Limit:
@@ -157,6 +180,11 @@ def _common(row: dict[str, Any], file: str | Path, where: str) -> tuple[str, tup
     if not isinstance(channel, str) or not channel:
         raise InputError("names no channel", file=file, column=where, remedy='e.g. channel = "gauge"')
     low, high = _range(row.get("speed_kmh", [0.0, math.inf]), file, f"{where}.speed_kmh")
+    return channel, (low / 3.6, high / 3.6), *_origin(row, file, where)
+
+
+def _origin(row: dict[str, Any], file: str | Path, where: str) -> tuple[str, str]:
+    """Status and source of an entry."""
     status = row.get("status", "own")
     if status not in STATUS:
         raise InputError(
@@ -165,7 +193,7 @@ def _common(row: dict[str, Any], file: str | Path, where: str) -> tuple[str, tup
     source = str(row.get("source", ""))
     if status != "own" and not source:
         raise InputError(f"is {status} but names no source", file=file, column=where, remedy="add source")
-    return channel, (low / 3.6, high / 3.6), status, source
+    return str(status), source
 
 
 def _base(channel: str, file: str | Path, where: str) -> float:

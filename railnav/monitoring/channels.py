@@ -1,4 +1,4 @@
-"""Track geometry channels: longitudinal level, alignment, cross level, gauge, twist, curvature, each with what it can bear.
+"""Track geometry channels: longitudinal level and alignment of the axis and of each rail, cross level, gauge, twist, curvature.
 
 Names and signs: longitudinal level is the height of the track above its smoothed course, positive upwards; alignment its distance to the
 right; cross level positive with the left rail high; twist the growth of cross level over a base; gauge as measured. All as
@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from railnav.errors import TrackError
+from railnav.monitoring.channel import SAMPLES_A_WAVE, Channel
 from railnav.monitoring.filters import (
+    D0,
     D1,
     D2,
     D3_ALIGNMENT,
@@ -25,6 +27,7 @@ from railnav.monitoring.filters import (
     band_pass,
     low_pass,
 )
+from railnav.monitoring.rails import rail_channels
 from railnav.monitoring.recording import Recording, Series
 from railnav.monitoring.versines import Chord
 
@@ -34,45 +37,6 @@ FloatArray = NDArray[np.float64]
 TWIST_BASES = (3.0, 9.0)
 #: Shortest wavelength that is asked of GNSS positions, m.
 SHORTEST_GNSS = 200.0
-#: A displacement's wavelength needs this many samples.
-SAMPLES_A_WAVE = 3.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Channel:
-    """One channel on the grid of a section.
-
-    Attributes
-    ----------
-    key : str
-        e.g. "longitudinal_level_d1", "twist_3m", "gauge".
-    title : str
-        In words.
-    unit : str
-        SI unit of the values: "m", "m/m" or "1/m".
-    values : (n,) array
-        NaN where there is no answer.
-    sigma : float
-        Standard deviation of a value: by the white noise of the samples, at most, and for bands by the error of place as well; NaN unknown.
-    source : str
-        The stream, in words.
-    band : Band or None
-    spacing : float
-        Distance between raw samples, m.
-    local : (n,) array or None
-        Standard deviation place by place, where it differs: in bands, an error of place costs most where the model's shape, taken off, is
-        sharpest.
-    """
-
-    key: str
-    title: str
-    unit: str
-    values: FloatArray
-    sigma: float
-    source: str
-    band: Band | None = None
-    spacing: float = math.nan
-    local: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,6 +147,9 @@ def channels_of(recording: Recording, *, bases: Sequence[float] = TWIST_BASES) -
         refused["gauge"] = "the run has no gauge stream"
     _cross_level(recording, bases, channels, refused)
     _bands(recording, channels, refused)
+    rails, without = rail_channels(recording, channels)
+    channels |= rails
+    refused |= without
     if "curvature_full" in series:
         curve = series["curvature_full"]
         smooth = low_pass(curve.values, step, 25.0)
@@ -252,13 +219,13 @@ def twist_key(base: float) -> str:
 
 #: The banded channels: key, title, series in the order preferred with how often to integrate and the sign, bands.
 _BANDED: tuple[tuple[str, str, tuple[tuple[str, int], ...], tuple[Band, ...]], ...] = (
-    ("longitudinal_level", "Longitudinal level", (("slope", 1), ("pitch_rate", 2)), (D1, D2, D3_LEVEL)),
+    ("longitudinal_level", "Longitudinal level", (("slope", 1), ("pitch_rate", 2)), (D0, D1, D2, D3_LEVEL)),
     ("alignment", "Alignment", (("bearing", 1), ("curvature", 2)), (D1, D2, D3_ALIGNMENT)),
 )
 
 
 def _bands(recording: Recording, channels: dict[str, Channel], refused: dict[str, str]) -> None:
-    """Longitudinal level and alignment in D1, D2, D3, each from the first series that is fine enough."""
+    """Longitudinal level and alignment of the axis in their bands, each from the series that leaves least noise."""
     for name, title, sources, bands in _BANDED:
         present = [(recording.series[key], times) for key, times in sources if key in recording.series]
         for band in bands:
@@ -270,7 +237,13 @@ def _bands(recording: Recording, channels: dict[str, Channel], refused: dict[str
             if not fine:
                 best = min(of.spacing for of, _ in present)
                 refused[key] = (
-                    f"sampled each {best:.1f} m; {band.name}, waves from {band.lower:g} m, takes {band.lower / SAMPLES_A_WAVE:.1f} m"
+                    f"sampled each {best:.2g} m; {band.name}, waves from {band.lower:g} m, takes {band.lower / SAMPLES_A_WAVE:.2g} m"
+                )
+                continue
+            if recording.step > band.lower / SAMPLES_A_WAVE:
+                enough = f"{band.lower / SAMPLES_A_WAVE:.2g} m"
+                refused[key] = (
+                    f"{band.name}, waves from {band.lower:g} m, takes steps of {enough}, not of {recording.step:g} m"
                 )
                 continue
             of, times = min(fine, key=lambda pair: band_noise(pair[0].noise, pair[0].spacing, band, integrate=pair[1]))

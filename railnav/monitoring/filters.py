@@ -48,11 +48,13 @@ class Band:
 
     @property
     def settling(self) -> float:
-        """Length beside an end or a gap that is not evaluated, m: one and a half of the longest wave, and the error is below 1 %."""
-        return 1.5 * self.upper
+        """Length beside an end or a gap left empty, m: one and three quarters of the longest wave, and the error is below 1 %."""
+        return 1.75 * self.upper
 
 
-#: Wavelengths of EN 13848-1; the longest band of alignment reaches further than that of longitudinal level.
+#: Wavelengths of EN 13848-1; the longest band of alignment reaches further than that of longitudinal level. D0, short waves of
+#: longitudinal level, is 1 to 5 m in SignalProcessingTools, which cites EN 13848-1 (read there, not in the standard).
+D0 = Band("D0", 1.0, 5.0)
 D1, D2 = Band("D1", 3.0, 25.0), Band("D2", 25.0, 70.0)
 D3_LEVEL, D3_ALIGNMENT = Band("D3", 70.0, 150.0), Band("D3", 70.0, 200.0)
 

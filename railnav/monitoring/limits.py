@@ -1,4 +1,4 @@
-"""Limits and quality: where a channel is beyond its limits, how it spreads over 200 m, and which class that is.
+"""Limits: where a channel is beyond them, and which channels can be held against them at all.
 
 Limits come from an editable table (`railnav.io.limits`); each value carries its source and whether it was read there.
 """
@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from railnav.errors import TrackError
-from railnav.monitoring.channels import Channel, Geometry
+from railnav.monitoring.channel import Channel
+from railnav.monitoring.channels import Geometry
 from railnav.monitoring.filters import stretches
+from railnav.monitoring.rails import RAILS, axis_key, rail_key
 
 FloatArray = NDArray[np.float64]
 
@@ -30,8 +31,6 @@ LEAST_SHARE = 0.2
 ONE_DEFECT = 2.0
 #: A passage whose track is certain in less than this share of its rows is not judged: which track it shows is not known.
 CERTAIN = 0.5
-#: Length over which standard deviations are taken, m, and the share of it that must be known.
-SEGMENT, KNOWN = 200.0, 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +77,15 @@ class ClassLimit:
 
 
 @dataclass(frozen=True, slots=True)
+class Combination:
+    """Weights of the combined standard deviation, by channel: a channel without one is left out."""
+
+    weights: Mapping[str, float]
+    status: str
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
 class LimitTable:
     """A table of limits.
 
@@ -90,6 +98,8 @@ class LimitTable:
     deviations : tuple of Limit
         Of standard deviations over 200 m.
     classes : tuple of ClassLimit
+    combined : Combination or None
+        How standard deviations are combined into one.
     """
 
     name: str
@@ -97,12 +107,19 @@ class LimitTable:
     limits: tuple[Limit, ...]
     deviations: tuple[Limit, ...]
     classes: tuple[ClassLimit, ...]
+    combined: Combination | None = None
+
+    @property
+    def status(self) -> tuple[str, ...]:
+        """Status of every entry: "read", "recalled" or "own"."""
+        limits = tuple(limit.status for limit in (*self.limits, *self.deviations))
+        combined = () if self.combined is None else (self.combined.status,)
+        return limits + tuple(limit.status for limit in self.classes) + combined
 
     @property
     def recalled(self) -> int:
         """How many entries were recalled rather than read."""
-        status = [limit.status for limit in (*self.limits, *self.deviations)] + [limit.status for limit in self.classes]
-        return status.count("recalled")
+        return self.status.count("recalled")
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,37 +181,6 @@ class Verdict:
     share: float = 0.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Segment:
-    """Standard deviation of one channel over one segment of a section.
-
-    Attributes
-    ----------
-    channel : str
-    start, finish : float
-        Distance along the section, m.
-    track : str
-        At the middle.
-    chainage : float
-        At the middle, m.
-    deviation : float
-        Standard deviation about the segment's mean, m.
-    grade : str
-        Class A to E, or empty where the table has none.
-    alert : float
-        Alert limit of the standard deviation, m; NaN where the table has none.
-    """
-
-    channel: str
-    start: float
-    finish: float
-    track: str
-    chainage: float
-    deviation: float
-    grade: str
-    alert: float
-
-
 def exceedances(geometry: Geometry, table: LimitTable, speed: float) -> tuple[list[Exceedance], list[Verdict]]:
     """Hold the channels of a run against limits.
 
@@ -211,7 +197,8 @@ def exceedances(geometry: Geometry, table: LimitTable, speed: float) -> tuple[li
         Severest first, then along the section.
     list of Verdict
         One for each channel that the table limits or the run gives: judged, or why not. A channel whose sigma is over a third of its
-        mildest limit is not judged.
+        mildest limit is not judged. Where a run shows both rails, the limits of level and alignment hold for each of them, and their
+        axis is not judged again.
     """
     found: list[Exceedance] = []
     verdicts: list[Verdict] = []
@@ -220,12 +207,16 @@ def exceedances(geometry: Geometry, table: LimitTable, speed: float) -> tuple[li
     for key in (*geometry.channels, *sorted(named - set(geometry.channels))):
         channel = geometry.channels.get(key)
         title = channel.title if channel else key.replace("_", " ")
-        limits = [limit for limit in table.limits if limit.channel == key and _holds(limit.speed, speed)]
+        mine = axis_key(key)
+        limits = [limit for limit in table.limits if limit.channel == mine and holds(limit.speed, speed)]
         sigma = channel.sigma if channel else math.nan
         if channel is None:
             verdicts.append(Verdict(key, title, sigma, math.nan, geometry.refused.get(key, "not recorded")))
             continue
-        if key not in named:
+        if channel.band is not None and all(rail_key(key, rail) in geometry.channels for rail in RAILS):
+            verdicts.append(Verdict(key, title, sigma, math.nan, "judged rail by rail"))
+            continue
+        if mine not in named:
             verdicts.append(Verdict(key, title, sigma, math.nan, "the table has no limit for it"))
             continue
         if not limits:
@@ -250,7 +241,8 @@ def exceedances(geometry: Geometry, table: LimitTable, speed: float) -> tuple[li
     return sorted(found, key=lambda e: (order[e.level], e.peak)), verdicts
 
 
-def _holds(span: tuple[float, float], speed: float) -> bool:
+def holds(span: tuple[float, float], speed: float) -> bool:
+    """Whether a speed lies in a range: above its lower end, up to its upper one."""
     return span[0] < speed <= span[1] + 1e-9
 
 
@@ -305,79 +297,3 @@ def _joined(parts: list[tuple[int, int]], within: int) -> list[tuple[int, int]]:
         else:
             out.append((a, b))
     return out
-
-
-def segments(geometry: Geometry, table: LimitTable, speed: float, *, length: float = SEGMENT) -> list[Segment]:
-    """Standard deviations of the channels over segments of a section, with class and alert limit.
-
-    Parameters
-    ----------
-    geometry : Geometry
-    table : LimitTable
-    speed : float
-        Speed of the line, m/s.
-    length : float
-        Of a segment, m.
-
-    Returns
-    -------
-    list of Segment
-        Of the banded channels; a segment of which less than half is known is left out.
-    """
-    section, step = geometry.recording.passage.section, geometry.recording.step
-    n = round(length / step)
-    count = len(geometry.distance) // n
-    out: list[Segment] = []
-    middle = (np.arange(count) + 0.5) * length
-    track, _ = section.locate(middle)
-    chainage = section.at(middle).chainage if count else middle
-    for channel in geometry.channels.values():
-        if channel.band is None:
-            continue
-        deviation = deviations(channel.values, n)
-        classes = [c for c in table.classes if c.channel == channel.key and _holds(c.speed, speed)]
-        alert = [d for d in table.deviations if d.channel == channel.key and _holds(d.speed, speed)]
-        out += [
-            Segment(
-                channel=channel.key,
-                start=float(i * length),
-                finish=float((i + 1) * length),
-                track=section.model.track_id[int(track[i])],
-                chainage=float(chainage[i]),
-                deviation=float(deviation[i]),
-                grade=grade(float(deviation[i]), classes[0]) if classes else "",
-                alert=alert[0].levels["alert"][1] if alert and "alert" in alert[0].levels else math.nan,
-            )
-            for i in np.flatnonzero(np.isfinite(deviation))
-        ]
-    return out
-
-
-def deviations(values: FloatArray, count: int) -> FloatArray:
-    """Standard deviation of each whole block of samples about its mean; NaN where less than half is known.
-
-    Examples
-    --------
-    >>> deviations(np.array([1.0, -1.0, 1.0, -1.0, np.nan, np.nan, np.nan, 2.0]), 4)
-    array([ 1., nan])
-    """
-    if count < 2:
-        raise TrackError(f"a standard deviation of {count} samples is none")
-    blocks = values[: len(values) // count * count].reshape(-1, count)
-    known = np.isfinite(blocks)
-    n = known.sum(axis=1)
-    filled = np.where(known, blocks, 0.0)
-    mean = filled.sum(axis=1) / np.maximum(n, 1)
-    square = np.where(known, (blocks - mean[:, None]) ** 2, 0.0).sum(axis=1) / np.maximum(n, 1)
-    return np.where(n >= KNOWN * count, np.sqrt(square), np.nan)
-
-
-def grade(deviation: float, limits: ClassLimit) -> str:
-    """Class of a standard deviation: the first whose upper limit it does not pass.
-
-    Examples
-    --------
-    >>> grade(0.9e-3, ClassLimit("longitudinal_level_d1", (0.0, 40.0), (0.75e-3, 1.1e-3, 1.8e-3, 2.5e-3), "read", ""))
-    'B'
-    """
-    return CLASSES[int(np.searchsorted(limits.limits, deviation, side="left"))]

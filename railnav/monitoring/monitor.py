@@ -10,8 +10,9 @@ import numpy as np
 
 from railnav.errors import OffModelError, TrackError
 from railnav.monitoring.channels import TWIST_BASES, Geometry, channels_of
-from railnav.monitoring.limits import CERTAIN, Exceedance, LimitTable, Segment, Verdict, exceedances, segments
+from railnav.monitoring.limits import CERTAIN, Exceedance, LimitTable, Verdict, exceedances
 from railnav.monitoring.overlay import Overlay, overlay, shifted
+from railnav.monitoring.quality import Segment, segments
 from railnav.monitoring.recording import record
 from railnav.monitoring.section import Passage, Section, onto, passages_of
 from railnav.monitoring.trends import Trend, trends

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from railnav.errors import EstimationError
 from railnav.monitoring.channels import Geometry
-from railnav.monitoring.limits import SEGMENT, deviations
+from railnav.monitoring.quality import SEGMENT, deviations
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -110,6 +110,8 @@ def irregular(
     alignment: float = 0.9e-3,
     cross_level: float = 0.9e-3,
     gauge: float = 1.0e-3,
+    times: float = 1.0,
+    tracks: Sequence[str] | None = None,
     defects: Sequence[Defect] = (),
 ) -> Irregularities:
     """Make fields of irregularities over all tracks of a model.
@@ -124,6 +126,10 @@ def irregular(
         Same seed, same fields; each track draws from its own stream.
     level, alignment, cross_level, gauge : float
         Standard deviation in waves of 3 to 25 m, m.
+    times : float
+        All four, times this.
+    tracks : sequence of str, optional
+        Only these tracks are irregular; by default all. What a track gets does not hang on the others.
     defects : sequence of Defect
 
     Returns
@@ -134,7 +140,7 @@ def irregular(
     Raises
     ------
     TrackError
-        A defect of an unknown kind, or off its track.
+        A defect of an unknown kind, or off its track; a negative size.
 
     Examples
     --------
@@ -146,8 +152,13 @@ def irregular(
     count = np.floor(model.lengths / STEP + 1e-9).astype(np.int64) + 1
     start = np.append(0, np.cumsum(count))
     fields = np.zeros((start[-1], len(KINDS)))
-    wanted = (alignment, level, cross_level, gauge)
+    wanted = tuple(times * size for size in (alignment, level, cross_level, gauge))
+    if min(wanted) < 0.0:
+        raise TrackError(f"irregularities of {1e3 * min(wanted):g} mm: a size is not negative")
+    rough = set(range(len(count))) if tracks is None else {model.track_index(name) for name in tracks}
     for i, generator in enumerate(map(np.random.default_rng, np.random.SeedSequence(seed).spawn(len(count)))):
+        if i not in rough:
+            continue
         block = fields[start[i] : start[i + 1]]
         for k, sigma in enumerate(wanted):
             if sigma > 0.0:

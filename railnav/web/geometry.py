@@ -14,7 +14,8 @@ from railnav.web.page import Card, Figure, Section, Table, Warnings, page
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from railnav.monitoring.channels import Channel, Geometry
+    from railnav.monitoring.channel import Channel
+    from railnav.monitoring.channels import Geometry
     from railnav.monitoring.limits import Exceedance
     from railnav.monitoring.monitor import Monitored, Report
     from railnav.monitoring.section import Section as TrackSection
@@ -379,7 +380,7 @@ def _lead(report: Report, shown: Sequence[Exceedance]) -> str:
 def _table_warning(report: Report) -> list[str]:
     lines = []
     if report.table.recalled:
-        total = len(report.table.limits) + len(report.table.deviations) + len(report.table.classes)
+        total = len(report.table.status)
         lines.append(
             f"{report.table.recalled} of {total} entries of the table of limits are recalled, not read in their standard; they are marked "
             "below. Check them, or use a table of your own (--limits), before anything hangs on them."
@@ -515,7 +516,7 @@ def _quality_section(report: Report) -> Section:
                     [
                         part.section.name,
                         geometry.recording.run.id,
-                        geometry.channels[key].title,
+                        mine[0].title,
                         f"{len(mine):,}",
                         *(f"{v:.2f}" for v in (np.median(sd), np.quantile(sd, 0.9), sd.max())),
                         f"{over:,}" if np.isfinite(mine[0].alert) else "",

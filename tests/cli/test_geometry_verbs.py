@@ -34,7 +34,7 @@ def run(*words: object) -> tuple[int, str, str]:
 
 
 def test_monitor_writes_a_page_that_asks_nothing_of_the_network(cars, tmp_path):
-    page, channels, found = tmp_path / "g.html", tmp_path / "c.parquet", tmp_path / "e.csv"
+    page, channels, found, quality = (tmp_path / name for name in ("g.html", "c.parquet", "e.csv", "q.csv"))
     code, out, _ = run(
         "monitor",
         cars / "car-1",
@@ -47,6 +47,8 @@ def test_monitor_writes_a_page_that_asks_nothing_of_the_network(cars, tmp_path):
         channels,
         "--exceedances",
         found,
+        "--quality",
+        quality,
         "--against",
         "model",
     )
@@ -66,8 +68,13 @@ def test_monitor_writes_a_page_that_asks_nothing_of_the_network(cars, tmp_path):
     assert "connect-src &#x27;none&#x27;" in html
     with found.open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    assert {"gauge", "longitudinal_level_d1", "alignment_d1"} <= {row["channel"] for row in rows}
+    assert {"gauge", "longitudinal_level_left_d1", "alignment_right_d1"} <= {row["channel"] for row in rows}
     assert channels.stat().st_size > 100_000
+    with quality.open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert {"combined", "gauge_d1", "longitudinal_level_left_d1"} <= {row["channel"] for row in rows}
+    assert {row["class"] for row in rows if row["channel"] == "longitudinal_level_left_d1"} <= set("ABCDE")
+    assert all(float(row["deviation_mm"]) > 0.0 for row in rows)
 
 
 def test_monitor_in_json(cars, tmp_path):

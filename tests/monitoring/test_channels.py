@@ -72,6 +72,42 @@ def test_stated_sigma_covers_the_error_of_every_channel():
         assert 0.25 < np.mean(ratio) < 1.5, f"{key}: {ratio}"
 
 
+@pytest.mark.parametrize("backwards", [False, True], ids=["with offset", "against it"])
+@pytest.mark.parametrize("rail", ["left", "right"])
+def test_rails_are_the_simulated_ones_whichever_way_the_car_ran(rail, backwards):
+    """Left stands above by half the cross level and to the left by half the gauge; errors within the stated sigma."""
+    made = geometry(1, backwards=backwards)
+    which, offset = made.recording.passage.section.locate(made.distance)
+    right, up, cross, gauge = fields().at(which, offset).T
+    side = 0.5 if rail == "left" else -0.5
+    for name, field in (("longitudinal_level", up + side * cross), ("alignment", right - side * gauge)):
+        for band in (1, 2, 3):
+            channel = made.channels[f"{name}_{rail}_d{band}"]
+            error = channel.values - band_pass(field, 0.25, channel.band)
+            size = np.nanstd(band_pass(field, 0.25, channel.band))
+            assert np.nanstd(error) < 0.15 * size, (
+                f"{name} D{band}: {1e3 * np.nanstd(error):.3f} of {1e3 * size:.3f} mm"
+            )
+            assert 0.2 < np.nanstd(error) / channel.sigma < 1.5
+
+
+def test_short_waves_of_level_are_given_where_samples_are_close_enough():
+    made = geometry(1)
+    assert made.channels["longitudinal_level_left_d0"].band.lower == 1.0
+    assert "longitudinal_level_d0" not in channels_of(record(recorded(1), passage(1), step=0.5)).channels
+    coarse = channels_of(record(recorded(1), passage(1), step=0.5)).refused
+    assert "takes steps of 0.33 m, not of 0.5 m" in coarse["longitudinal_level_d0"]
+
+
+def test_rails_are_refused_with_the_reason_where_cross_level_or_gauge_is_missing():
+    run = recorded(1)
+    made = channels_of(record(replace(run, gauge=replace(run.gauge, cant=None)), passage(1), against_model=True))
+    assert "longitudinal_level_left_d1" in made.channels  # by the roll of the body
+    made = channels_of(record(replace(run, gauge=None), passage(1), against_model=True))
+    assert "the run has no gauge" in made.refused["alignment_left_d1"]
+    assert "alignment_d1" in made.channels
+
+
 def test_twist_is_the_growth_of_cross_level_and_a_ramp_shows_its_slope():
     made = geometry(1)
     true = true_of(made, "cross_level")

@@ -14,8 +14,10 @@ from railnav.io.geometry import write_channels, write_exceedances
 from railnav.io.limits import default_limits, default_text, read_limits
 from railnav.monitoring.channels import channels_of
 from railnav.monitoring.filters import D1, band_pass
-from railnav.monitoring.limits import LEVELS, ClassLimit, deviations, exceedances, grade, segments
+from railnav.monitoring.limits import LEVELS, ClassLimit, Combination, exceedances
 from railnav.monitoring.monitor import monitor, speed_class
+from railnav.monitoring.quality import COMBINED, deviations, grade, segments
+from railnav.monitoring.rails import RAILS
 from railnav.monitoring.recording import record
 from railnav.monitoring.section import onto, passages_of, section_of
 from railnav.monitoring.trends import false_discoveries, growth, trends
@@ -84,6 +86,9 @@ def test_twist_limits_are_over_the_base():
         (lambda t: t.replace("[1.25, 1.75, 2.75, 3.75]", "[1.25, 1.75, 2.75]"), "class 1: limits are"),
         (lambda t: t.replace('channel = "twist_3m"', 'channel = "twist_m"', 1), "names no base"),
         (lambda t: t.replace("immediate = 21", "imediate = 21"), "unknown key 'imediate'"),
+        (lambda t: t.replace("gauge_d1 = 1.0", "gauge = 1.0"), "combined: unknown key 'gauge'"),
+        (lambda t: t.replace("gauge_d1 = 1.0", "gauge_d1 = -1.0"), "combined.gauge_d1: -1.0 is no weight"),
+        (lambda t: t.replace("_d1 = 1.0", "_d1 = 0"), "combined: weighs nothing"),
         (lambda t: t.replace("[table]", "[table", 1), "is no TOML"),
         (lambda _: "", "holds no limit"),
     ],
@@ -111,26 +116,48 @@ def test_an_edited_table_is_used(tmp_path):
 # --- exceedances ------------------------------------------------------------------------------------------------------
 
 
-def test_every_simulated_defect_beyond_a_limit_is_reported_with_its_place():
-    found, _ = exceedances(geometry(1), default_limits(), SPEED)
+def field_of(key: str, s: np.ndarray) -> np.ndarray:
+    """The simulated track of a channel along TRACK: gauge as it is, a rail's channel in D1."""
     which = line().track_index(TRACK)
+    right, up, cross, gauge = fields().at(np.full(len(s), which), s).T
+    if key == "gauge":
+        return gauge
+    side = 0.5 if "_left_" in key else -0.5
+    return band_pass(up + side * cross if key.startswith("longitudinal") else right - side * gauge, 0.25, D1)
+
+
+def test_every_simulated_defect_beyond_a_limit_is_reported_with_its_place():
+    """A defect of level or alignment shows on both rails, and half of one of gauge or cross level on each."""
+    found, _ = exceedances(geometry(1), default_limits(), SPEED)
     s = np.arange(0.0, line().length(TRACK), 0.25)
-    true = {"longitudinal_level_d1": 1, "gauge": 3, "alignment_d1": 0}
-    for defect, key in zip(DEFECTS[:3], true, strict=True):
-        field = fields().at(np.full(len(s), which), s)[:, true[key]]
-        field = field if key == "gauge" else band_pass(field, 0.25, D1)
-        near = np.abs(s - defect.offset) < 5.0
-        peak = field[near][np.nanargmax(np.abs(field[near]))]
-        mine = [e for e in found if e.channel == key and abs(e.offset - defect.offset) < 5.0 and e.value * peak > 0]
-        assert len(mine) == 1, key
-        assert mine[0].track == TRACK
-        assert mine[0].value == pytest.approx(peak, abs=1e-3)
-        point = line().at(TRACK, mine[0].offset)
-        assert (mine[0].easting, mine[0].northing) == pytest.approx(
-            (float(point.easting), float(point.northing)), abs=1e-6
-        )
-        assert 0.0 < mine[0].length < defect.length + 2.0
+    for defect, name in zip(DEFECTS[:3], ("longitudinal_level", "gauge", "alignment"), strict=True):
+        for key in [name] if name == "gauge" else [f"{name}_{rail}_d1" for rail in ("left", "right")]:
+            field = field_of(key, s)
+            near = np.abs(s - defect.offset) < 5.0
+            peak = field[near][np.nanargmax(np.abs(field[near]))]
+            mine = [e for e in found if e.channel == key and abs(e.offset - defect.offset) < 5.0 and e.value * peak > 0]
+            assert len(mine) == 1, key
+            assert mine[0].track == TRACK
+            assert mine[0].value == pytest.approx(peak, abs=1e-3)
+            point = line().at(TRACK, mine[0].offset)
+            assert (mine[0].easting, mine[0].northing) == pytest.approx(
+                (float(point.easting), float(point.northing)), abs=1e-6
+            )
+            assert 0.0 < mine[0].length < defect.length + 2.0
+    assert not [e for e in found if e.channel in ("longitudinal_level_d1", "alignment_d1")]
     assert [LEVELS.index(e.level) for e in found] == sorted((LEVELS.index(e.level) for e in found), reverse=True)
+
+
+def test_limits_hold_for_each_rail_and_for_the_axis_only_where_rails_are_not_shown():
+    made = geometry(1)
+    _, verdicts = exceedances(made, default_limits(), SPEED)
+    reason = {v.channel: v.reason for v in verdicts}
+    assert reason["longitudinal_level_d1"] == reason["alignment_d1"] == "judged rail by rail"
+    assert not any(reason[f"{name}_{rail}_d1"] for name in ("longitudinal_level", "alignment") for rail in RAILS)
+    axis = {key: channel for key, channel in made.channels.items() if "_left_" not in key and "_right_" not in key}
+    found, verdicts = exceedances(replace(made, channels=axis), default_limits(), SPEED)
+    assert not {v.channel: v.reason for v in verdicts}["alignment_d1"]
+    assert {e.channel for e in found} >= {"longitudinal_level_d1", "alignment_d1"}
 
 
 def test_levels_follow_the_size():
@@ -310,6 +337,35 @@ def test_speed_classes():
     ]
 
 
+def test_combined_standard_deviation_weighs_what_the_track_really_spreads():
+    """Against the simulated fields: the mean of both rails in level and alignment, gauge and cross level, all in D1."""
+    made = geometry(1)
+    weights = {"longitudinal_level_d1": 0.8, "alignment_d1": 1.0, "gauge_d1": 0.5, "cross_level_d1": 0.3}
+    table = replace(default_limits(), combined=Combination(weights, "own", ""))
+    graded = [s for s in segments(made, table, SPEED) if s.channel == COMBINED]
+    assert len(graded) > 10
+    s = np.arange(0.0, line().length(TRACK), 0.25)
+    which = line().track_index(TRACK)
+    _, _, cross, gauge = fields().at(np.full(len(s), which), s).T
+    parts = {
+        "longitudinal_level_d1": [field_of(f"longitudinal_level_{rail}_d1", s) for rail in RAILS],
+        "alignment_d1": [field_of(f"alignment_{rail}_d1", s) for rail in RAILS],
+        "gauge_d1": [band_pass(gauge, 0.25, D1)],
+        "cross_level_d1": [band_pass(cross, 0.25, D1)],
+    }
+    for one in graded:
+        here = (s >= one.start) & (s < one.finish)
+        if not 300.0 + 37.5 < one.start < one.finish < 3300.0 - 37.5:
+            continue
+        expected = math.sqrt(sum(w * np.mean([np.std(p[here]) for p in parts[key]]) ** 2 for key, w in weights.items()))
+        assert one.deviation == pytest.approx(expected, rel=0.05)
+    lone = replace(default_limits(), combined=Combination({"alignment_d1": 1.0}, "own", ""))
+    by_rail = {s.channel: s.deviation for s in segments(made, lone, SPEED) if s.start == 1600.0}
+    assert by_rail[COMBINED] == pytest.approx(0.5 * (by_rail["alignment_left_d1"] + by_rail["alignment_right_d1"]))
+    without = replace(made, recording=replace(made.recording, series={}))
+    assert not [s for s in segments(without, default_limits(), SPEED) if s.channel == COMBINED]
+
+
 @pytest.mark.parametrize("sensors", ["imu", "angles"])
 def test_perfect_track_with_turnouts_has_no_exceedance(sensors):
     """No irregularities, but turnouts of 300 m radius, taken by a train whose place is known to centimetres or decimetres."""
@@ -324,7 +380,8 @@ def test_perfect_track_with_turnouts_has_no_exceedance(sensors):
     run, _ = simulate(line(), leg, seed=6, outfit=outfit, tunnels=False)
     made = monitor([run], line(), default_limits(), against_model=True)
     part = made.sections[0]
-    assert [v.channel for v in part.verdicts[0] if v.channel == "alignment_d1" and not v.reason]
+    judged = {v.channel for v in part.verdicts[0] if not v.reason}
+    assert judged >= ({"alignment_d1"} if sensors == "imu" else {"alignment_left_d1", "alignment_right_d1"})
     assert [(e.channel, round(1e3 * e.value, 1), e.track, round(e.offset)) for e in part.exceedances] == []
 
 
