@@ -38,8 +38,6 @@ SPIRALS = {
 
 
 KNOWN = "clothoid, bloss, cosine, sinusoid (Klein), biquadratic (Helmert), wienerBogen, cubicParabola"
-
-
 ANGLES = {
     "radians": 1.0,
     "grads": math.pi / 200.0,

@@ -31,24 +31,14 @@ from railnav.units import wrap_angle
 FloatArray = NDArray[np.float64]
 #: An element shorter than this is none, m.
 _NOTHING = 1e-3
-
-
 #: Distance of the rails' middles, m: what turns cant into an angle.
 _CANT_BASE = 1.5
-
-
 #: Heights of a vehicle's centre of gravity that a Viennese bend may be made for, m.
 _SWAY_HEIGHT = (0.5, 3.0)
-
-
 #: From just behind the start of an element to just before its end, m.
 _INSIDE = np.array([1e-6, -1e-6])
-
-
 #: A cubic parabola ends within this of its stated end, m: a clothoid, or another curve of that name, is some millimetres off or more.
 _CUBIC_GAP = 2e-3
-
-
 #: What `dir` may mean: name, bearing of its zero, its sense.
 _SENSES = (
     ("clockwise from north", 0.0, 1.0),

@@ -20,12 +20,8 @@ from railnav.track.elements import Gradients
 FloatArray = NDArray[np.float64]
 #: Stations that agree within this are one, m.
 SAME_STATION = 0.01
-
-
 #: Cant whose station lies further than this outside the plan is said, m.
 _OUTSIDE = 0.01
-
-
 #: Half the distance of a pair of chainages on either side of a station equation, m.
 EQUATION = 5e-4
 

@@ -20,7 +20,7 @@ from railnav.errors import InputError
 from railnav.geodesy.grid import GridFrame, choose_frame, frame_for_grid
 from railnav.io.design import lay
 from railnav.io.drawn import lay_line
-from railnav.io.railml import _Reader
+from railnav.io.railml_document import Reader
 from railnav.io.xml_document import children, local_name
 from railnav.track.alignment import KnotTable
 from railnav.track.assembly import TrackSection, assemble
@@ -61,7 +61,7 @@ def read_tracks(path: Path, root: Any, *, crs: Any, zone_width: int, ellipsoid: 
     InputError
         No tracks, a track without positions at its ends, coordinates of several systems, a connection to what is not there.
     """
-    reader = _Reader(path)
+    reader = Reader(path)
     nodes = [node for node in root.iter() if local_name(node) == "track" and children(node, "trackTopology")]
     if not nodes:
         raise InputError("has no track with a trackTopology", file=path, remedy="export the infrastructure")
@@ -106,7 +106,7 @@ def read_tracks(path: Path, root: Any, *, crs: Any, zone_width: int, ellipsoid: 
     )
 
 
-def _track(reader: _Reader, node: Any, systems: set[str]) -> _Track:
+def _track(reader: Reader, node: Any, systems: set[str]) -> _Track:
     name = str(node.get("id") or node.get("name") or "")
     if not name:
         reader.refuse(node, "has neither id nor name")
@@ -163,7 +163,7 @@ def _track(reader: _Reader, node: Any, systems: set[str]) -> _Track:
 
 
 def _frame(
-    reader: _Reader,
+    reader: Reader,
     root: Any,
     tracks: Sequence[_Track],
     systems: set[str],
@@ -223,7 +223,7 @@ def _frame(
 
 
 def _sections(
-    reader: _Reader, frame: GridFrame, track: _Track, points: FloatArray, spacing: float
+    reader: Reader, frame: GridFrame, track: _Track, points: FloatArray, spacing: float
 ) -> list[TrackSection]:
     """The track's parts between its switches."""
     bent = [radius for _, radius in track.radii if radius != 0.0]
@@ -273,7 +273,7 @@ def _sections(
     return sections
 
 
-def _by_radii(reader: _Reader, frame: GridFrame, track: _Track, points: FloatArray, spacing: float) -> KnotTable | None:
+def _by_radii(reader: Reader, frame: GridFrame, track: _Track, points: FloatArray, spacing: float) -> KnotTable | None:
     """Arcs and straights between radius changes, turned so that they lead from the first point towards the last."""
     changes = dict(sorted(track.radii))
     begin = np.array([0.0, *(at for at in changes if _SAME_POS < at < track.length - _SAME_POS)])
@@ -339,7 +339,7 @@ def _part(track: _Track, pos: float) -> tuple[int, float]:
     return k, float(np.clip((pos - borders[k]) / (borders[k + 1] - borders[k]), 0.0, 1.0))
 
 
-def _movements(reader: _Reader, tracks: Sequence[_Track], index: dict[str, int]) -> NDArray[np.int64]:
+def _movements(reader: Reader, tracks: Sequence[_Track], index: dict[str, int]) -> NDArray[np.int64]:
     """Through every cut, and by connections: ends of tracks to each other and to the switches of others."""
     rows: set[tuple[int, int, int, int]] = set()
     ends: dict[str, list[tuple[int, int]]] = {}  # id of a connection: ends of parts that a train reaches it by

@@ -13,7 +13,8 @@ import pytest
 from railnav.errors import InputError, RailnavError
 from railnav.geodesy.grid import frame_for_grid
 from railnav.io.drawn import round_lines
-from railnav.io.osm import kilometres, read_osm
+from railnav.io.osm import read_osm
+from railnav.io.osm_mileposts import kilometres
 from railnav.track.model import NodeKind
 from railnav.track.validation import validate
 
