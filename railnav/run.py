@@ -187,6 +187,8 @@ class Run:
         The streams that exist.
     source : path or None
         The folder the run was read from.
+    simulated : bool
+        Whether its streams were made by a simulation; what is worked out from them says so.
     """
 
     id: str
@@ -199,6 +201,7 @@ class Run:
     gauge: GaugeStream | None = None
     balise: BaliseStream | None = None
     source: Path | None = None
+    simulated: bool = False
 
     @classmethod
     def read(cls, folder: str | Path) -> Run:

@@ -143,7 +143,10 @@ def print_model(facts: dict[str, Any], title: str) -> None:
 
 def _maker(provenance: dict[str, Any]) -> str:
     """Name the source of a model from the top-level texts of its provenance."""
-    return "; ".join(f"{key}: {value}" for key, value in provenance.items() if isinstance(value, str | int | float))
+    said = {key: value for key, value in provenance.items() if isinstance(value, str | int | float)}
+    return "; ".join(
+        key if value is True else str(value) if key == "made_by" else f"{key}: {value}" for key, value in said.items()
+    )
 
 
 def describe_run(run: Run) -> dict[str, Any]:
@@ -176,6 +179,7 @@ def describe_run(run: Run) -> dict[str, Any]:
         "id": run.id,
         "start": run.start.isoformat(),
         "direction": run.direction,
+        "simulated": run.simulated,
         "duration_s": max(s["to_s"] for s in streams.values()) - min(s["from_s"] for s in streams.values())
         if streams
         else 0.0,
@@ -204,6 +208,7 @@ def print_run(facts: dict[str, Any], title: str) -> None:
             "run": facts["id"],
             "start": facts["start"],
             "direction": facts["direction"],
+            "data": "simulated" if facts["simulated"] else "",
             "duration": words.duration(facts["duration_s"]),
             "receiver": facts.get("receiver", ""),
             "frame": facts.get("frame", "")
@@ -267,6 +272,7 @@ def describe_solution(solution: Solution) -> dict[str, Any]:
         "placed": int(np.count_nonzero(placed)),
         "duration_s": float(solution.time[-1] - solution.time[0]) if len(solution) else 0.0,
         "smoothed": bool(solution.smoothed),
+        "simulated": bool(solution.simulated),
         "modes": {mode: n for mode, n in modes.items() if n},
         "tracks": [solution.track_id[int(order[k])] for k in changes],
         "sigma_along_m": _median_95(solution.sigma_along[placed]),
@@ -298,6 +304,7 @@ def print_solution(facts: dict[str, Any], title: str) -> None:
             "epochs": f"{facts['epochs']:,} in {words.duration(facts['duration_s'])}, "
             f"{words.share(facts['placed'] / epochs)} with a position",
             "kind": "smoothed (all of the run)" if facts["smoothed"] else "filtered (only what was known at the time)",
+            "data": "simulated" if facts["simulated"] else "",
             "modes": ", ".join(f"{mode} {words.share(n / epochs)}" for mode, n in facts["modes"].items()),
             "path": path,
             "top speed": words.speed(facts["top_speed_m_s"]),

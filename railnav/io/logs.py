@@ -19,7 +19,9 @@ from railnav.errors import RunError
 from railnav.io import gnss_time
 from railnav.io.atomic import atomic_folder, atomic_path
 from railnav.io.gnss_log import LogSummary, read_log, stream_log
-from railnav.io.run import _COLUMNS, CONTENTS, STREAMS, _Gnss, _gnss, _stream_columns, read_run, write_run
+from railnav.io.run import read_run, write_run
+from railnav.io.run_contents import CONTENTS, STREAMS, GnssEntry
+from railnav.io.run_streams import STREAM_COLUMNS, gnss_stream, stream_columns
 from railnav.io.tables import check_table
 from railnav.run import Run
 
@@ -118,13 +120,13 @@ def read_bare_log(
         return read_bag(path, topics=topics, start=start)
     begin = start or first_instant(path, kind)
     log = read_log(path, kind, start=begin)
-    check_table(log.table, _COLUMNS["gnss"])
+    check_table(log.table, STREAM_COLUMNS["gnss"])
     if report is not None:
         report(log.summary)
     run = Run(
         path.stem,
         begin,
-        gnss=_gnss(log.table, log.table.increasing("time_s"), _Gnss(path.name), begin, path),
+        gnss=gnss_stream(log.table, log.table.increasing("time_s"), GnssEntry(path.name), begin, path),
         source=path,
     )
     notes = (*log.summary.notes, *(_displaced(path, begin) if start is None else ()))
@@ -244,10 +246,10 @@ def _written() -> list[str]:
 
 
 def _head(run: Run) -> str:
-    from railnav.io.run import _quoted
+    from railnav.io.run_contents import quoted
 
     start = run.start.astimezone(UTC).isoformat().replace("+00:00", "Z")
-    return f"[run]\nid = {_quoted(run.id)}\nstart = {_quoted(start)}\n"
+    return f"[run]\nid = {quoted(run.id)}\nstart = {quoted(start)}\n"
 
 
 def _pieces(
@@ -276,9 +278,9 @@ def _pieces(
 
 def _scale_of(folder: Path) -> str:
     """Format of the fixes of a run folder: it says on which scale their quality is."""
-    from railnav.io.run import _read_contents
+    from railnav.io.run_contents import read_contents
 
-    contents = _read_contents(folder)
+    contents = read_contents(folder)
     return contents.gnss.format if contents.gnss is not None else "csv"
 
 
@@ -302,7 +304,7 @@ def _convert_run(run: Run, output: Path, *, scale: str) -> tuple[int, tuple[str,
         return count, ()
     if run.gnss is None or not count:
         raise RunError("the run has no GNSS fixes to write", file=run.source)
-    columns = _stream_columns(run, "gnss")
+    columns = stream_columns(run, "gnss")
     if scale == "rtklib-pos" and isinstance(columns.get("quality"), np.ndarray):
         from railnav.io.log_writers import to_gga
 

@@ -24,7 +24,8 @@ from railnav.inertial.positions import PositionLog
 from railnav.inertial.procedure import METHODS, RATE_METHODS, Method
 from railnav.inertial.turns import advise_turns
 from railnav.io.atomic import atomic_folder
-from railnav.io.run import CONTENTS, read_imu_table, read_run, write_run
+from railnav.io.run import read_imu_table, read_run, write_run
+from railnav.io.run_contents import CONTENTS
 from railnav.run import ImuStream, Run
 
 #: What the operator knows, beside the logs.

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from railnav.errors import InputError, RailnavError, RunError
 from railnav.io.gnss_log import LogSummary, read_log
-from railnav.io.run import _COLUMNS, CONTENTS, FORMATS, STREAMS, _read_contents, _start, _stream_file, read_run
+from railnav.io.run import read_run
+from railnav.io.run_contents import CONTENTS, FORMATS, STREAMS, read_contents, start_of, stream_file
+from railnav.io.run_streams import STREAM_COLUMNS
 from railnav.io.tables import Column, Table, read_table
 
 #: What is found: kind, where, what.
@@ -45,8 +47,8 @@ def run_defects(folder: str | Path) -> tuple[list[Finding], list[Finding]]:
     defects: list[Finding] = []
     remarks: list[Finding] = []
     try:
-        contents = _read_contents(folder)
-        start = _start(contents.run.start, folder / CONTENTS)
+        contents = read_contents(folder)
+        start = start_of(contents.run.start, folder / CONTENTS)
     except InputError as error:
         return [_finding("run", error)], []
     for name in STREAMS:
@@ -54,16 +56,18 @@ def run_defects(folder: str | Path) -> tuple[list[Finding], list[Finding]]:
         if stream is None:
             continue
         try:
-            path = _stream_file(folder, name, stream)
+            path = stream_file(folder, name, stream)
             if stream.format in FORMATS:
-                defects += [_finding(name, error) for error in _table_defects(path, _COLUMNS[name])]
+                defects += [_finding(name, error) for error in _table_defects(path, STREAM_COLUMNS[name])]
             elif name != "gnss":
                 from railnav.io.ubx_sensors import sensor_table
 
-                defects += [_finding(name, error) for error in _judge(sensor_table(path, name, start), _COLUMNS[name])]
+                defects += [
+                    _finding(name, error) for error in _judge(sensor_table(path, name, start), STREAM_COLUMNS[name])
+                ]
             else:
                 log = read_log(path, stream.format, start=start)
-                defects += [_finding(name, error) for error in _judge(log.table, _COLUMNS[name])]
+                defects += [_finding(name, error) for error in _judge(log.table, STREAM_COLUMNS[name])]
                 remarks += _log_remarks(name, log.summary)
         except InputError as error:
             defects.append(_finding(name, error))

@@ -1,7 +1,7 @@
 """Solution files: one row an output epoch, in CSV, Parquet, GeoPackage (points for QGIS) or GeoJSON, by the ending.
 
 Columns are those of the formats' chapter "A solution". What they cannot hold (run, start, plane, integrity risk, whether
-smoothed, running direction, diagnostics) rides in the metadata of Parquet, GeoPackage and GeoJSON; a CSV file has no such
+smoothed or simulated, running direction, diagnostics) rides in the metadata of Parquet, GeoPackage and GeoJSON; a CSV file has no such
 place, and reading one back takes the defaults of `Solution`.
 """
 
@@ -255,6 +255,7 @@ def _metadata(solution: Solution, path: Path) -> dict[str, Any]:
         "crs_wkt": solution.crs_wkt,
         "integrity_risk": solution.integrity_risk,
         "smoothed": solution.smoothed,
+        "simulated": solution.simulated,
         "running_direction": [[int(row), int(direction[row])] for row in changes],
         "diagnostics": diagnostics,
     }
@@ -307,6 +308,7 @@ def _solution(table: Table, others: Table | None = None) -> Solution:
         crs_wkt=str(metadata.get("crs_wkt", "")),
         integrity_risk=risk if isinstance(risk, float) and 0 < risk < 1 else 1e-4,
         smoothed=metadata.get("smoothed") is True,
+        simulated=metadata.get("simulated") is True,
         diagnostics=diagnostics if isinstance(diagnostics, dict) else {},
         alternatives=alternatives,
     )

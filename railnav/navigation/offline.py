@@ -206,6 +206,7 @@ def _solution(run: Run, engine: Engine, table: FloatArray, out: FloatArray, smoo
         crs_wkt=model.frame.crs_wkt,
         integrity_risk=float(engine.filter.risk[0]),
         smoothed=smooth,
+        simulated=run.simulated,
         diagnostics=_diagnostics(engine, mode, assumed),
         alternatives=Alternatives.none() if smooth else alternatives(engine),
     )

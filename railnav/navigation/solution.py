@@ -112,6 +112,8 @@ class Solution:
         The risk at which the protection level holds, per epoch.
     smoothed : bool
         Whether rows are fixed-interval smoothed rather than filtered.
+    simulated : bool
+        Whether the run was simulated.
     diagnostics : dict
         Counts and settings: epochs, fixes used and rejected, decisions; JSON values only.
     alternatives : Alternatives
@@ -144,6 +146,7 @@ class Solution:
     crs_wkt: str = ""
     integrity_risk: float = 1e-4
     smoothed: bool = False
+    simulated: bool = False
     diagnostics: dict[str, Any] = field(default_factory=dict)
     alternatives: Alternatives = field(default_factory=Alternatives.none)
 

@@ -227,7 +227,7 @@ def simulate(
         progress("simulating sensors", len(carried), len(carried))
     if not truth_interval > 0.0:
         raise TrackError(f"the interval of the truth is {truth_interval} s, not positive")
-    run = Run(id=run_id, start=start, direction=direction, **made)
+    run = Run(id=run_id, start=start, direction=direction, simulated=True, **made)
     return run, _truth(path, motion, _ticks(motion.duration, truth_interval), bool(known.all()))
 
 

@@ -9,7 +9,7 @@ the axes are tabulated by true ground length, with their covariances and a repor
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -312,6 +312,9 @@ def _assembled(
             )
         )
     tell("tabulate", len(tracks), len(tracks))
+    provenance: dict[str, Any] = {"made_by": "railnav build"}
+    if any(f.run.simulated for f in survey.fixes):
+        provenance["simulated"] = True
     sections, parts = join_tracks([t.name for t in tracks], tables, joins)
     text = report.compose(survey, tracks, offsets, heights, up, tables)
     if joins:
@@ -320,7 +323,6 @@ def _assembled(
             f"runs part in {len(joins)} places: turnouts were made there, and their tracks meet in nodes; such a model carries no survey "
             "records, build it from all runs when there are new ones"
         )
-        return assemble(frame, sections, join_within=0.05, provenance={"made_by": "railnav build", "build": text})
+        return assemble(frame, sections, join_within=0.05, provenance={**provenance, "build": text})
     records = keep_build(survey, tracks, offsets, heights, up)
-    provenance = {"made_by": "railnav build", "build": text}
-    return assemble(frame, sections, provenance=provenance, record_source=lambda: records)
+    return assemble(frame, sections, provenance={**provenance, "build": text}, record_source=lambda: records)

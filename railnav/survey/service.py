@@ -123,7 +123,7 @@ def refine_from_service(
             f"none of the {len(runs)} runs is navigated on the model with certainty anywhere: {told[0]['words']}",
             remedy="look at `railnav navigate` of one of them first",
         )
-    return _moved(model, chains, told)
+    return _moved(model, chains, told, simulated=any(run.simulated for run in runs))
 
 
 def _silent(stage: str, done: int, total: int) -> None:
@@ -307,7 +307,7 @@ def _reversed(curve: Any) -> Any:
 # ---------------------------------------------------------------- the refined model
 
 
-def _moved(model: TrackModel, chains: list[MapChain], told: list[dict[str, Any]]) -> TrackModel:
+def _moved(model: TrackModel, chains: list[MapChain], told: list[dict[str, Any]], *, simulated: bool) -> TrackModel:
     """The model with every axis where its chain says it lies; tracks that meet still meet."""
     from scipy.interpolate import CubicSpline
 
@@ -371,6 +371,8 @@ def _moved(model: TrackModel, chains: list[MapChain], told: list[dict[str, Any]]
         "gauge": "across the track only; offsets keep the model's labels, and a shift of the whole line is the model's own",
     }
     provenance = {**model.provenance, "service": [*model.provenance.get("service", []), entry]}
+    if simulated:
+        provenance["simulated"] = True
     return with_tables(model, tables, provenance, None)
 
 

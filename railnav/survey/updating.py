@@ -436,6 +436,8 @@ def _assembled(
         **model.provenance,
         "updates": [*model.provenance.get("updates", []), entry],
     }
+    if any(f.run.simulated for f in survey.fixes):
+        provenance["simulated"] = True
     return with_tables(model, tables, provenance, new_records)
 
 

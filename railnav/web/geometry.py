@@ -74,9 +74,7 @@ def geometry_page(report: Report) -> str:
     from railnav.web.report import SIMULATED, is_simulated
 
     runs = {g.recording.run.id: g.recording.run for part in report.sections for g in part.geometries}
-    simulated = is_simulated(report.model) or any(
-        run.gnss and run.gnss.receiver == "simulated" for run in runs.values()
-    )
+    simulated = is_simulated(report.model) or any(run.simulated for run in runs.values())
     found = [e for part in report.sections for e in part.exceedances]
     latest = {part.section.name: _latest(part) for part in report.sections}
     shown = [e for part in report.sections for e in part.exceedances if e.run == latest[part.section.name]]

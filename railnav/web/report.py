@@ -49,7 +49,7 @@ def solution_page(solution: Solution, model: TrackModel | None = None) -> str:
     return page(
         f"Solution {solution.run_id}".strip(),
         subtitle=_when(solution),
-        badge=SIMULATED if model is not None and is_simulated(model) else "",
+        badge=SIMULATED if solution.simulated or (model is not None and is_simulated(model)) else "",
         lead=[solution_words(solution)],
         cards=_solution_cards(solution),
         sections=[
@@ -80,7 +80,7 @@ def evaluation_page(solution: Solution, truth: Truth, evaluation: Evaluation, mo
     Returns
     -------
     str
-        HTML; labelled as simulated where the truth says so.
+        HTML; labelled as simulated where the truth, the solution or the model says so.
 
     Raises
     ------
@@ -90,7 +90,7 @@ def evaluation_page(solution: Solution, truth: Truth, evaluation: Evaluation, mo
     return page(
         f"Solution {solution.run_id} against the truth".replace("  ", " "),
         subtitle=_when(solution),
-        badge=SIMULATED if truth.simulated or (model is not None and is_simulated(model)) else "",
+        badge=SIMULATED if truth.simulated or solution.simulated or (model is not None and is_simulated(model)) else "",
         lead=evaluation_words(evaluation),
         cards=evaluation_cards(evaluation),
         sections=_evaluation_sections(solution, truth, evaluation, model),

@@ -139,6 +139,7 @@ def navigate_arc(
         start=run.start.isoformat().replace("+00:00", "Z"),
         crs_wkt=model.frame.crs_wkt,
         integrity_risk=integrity_risk,
+        simulated=run.simulated,
         diagnostics={
             "epochs": m,
             "modes": {kind.label: int((mode == kind).sum()) for kind in Mode},

@@ -301,6 +301,7 @@ def _solution(
         crs_wkt=plane.crs_wkt,
         integrity_risk=integrity_risk,
         smoothed=smooth,
+        simulated=run.simulated,
         diagnostics={
             "epochs": m,
             "modes": {kind.label: int((mode == kind).sum()) for kind in Mode},
