@@ -176,6 +176,8 @@ def write_run(run: Run, folder: str | Path, *, truth: Truth | None = None) -> No
     Examples
     --------
     >>> import tempfile
+    >>> from datetime import UTC, datetime
+    >>> from railnav.run import OdometerStream
     >>> run = Run("a", datetime(2026, 5, 4, 8, tzinfo=UTC), odometer=OdometerStream(np.arange(3.0), speed=np.ones(3)))
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     write_run(run, f"{folder}/a")
