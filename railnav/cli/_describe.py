@@ -417,7 +417,7 @@ def print_build(model: TrackModel, title: str) -> None:
 
 def print_evaluation(evaluation: Evaluation, title: str) -> None:
     """Print how good a solution is, and whether it knows."""
-    from railnav.web import report
+    from railnav.web import evaluation_report as report
 
     selection, integrity, found = evaluation.selection, evaluation.integrity, evaluation.consistency
     along, across, speed = evaluation.along_statistics, evaluation.across_statistics, evaluation.speed_statistics

@@ -159,7 +159,8 @@ def _demo(
     from railnav.io.truth import write_truth
     from railnav.navigation import navigate
     from railnav.survey import build
-    from railnav.web.report import demo_page, evaluation_words
+    from railnav.web.demo_report import demo_page
+    from railnav.web.evaluation_report import evaluation_words
 
     watch = _Watch()
     reference, surveys, later, service, simulated_truth = _simulated(seed, tell)

@@ -47,7 +47,7 @@ def command(
     line = _files.read_model(model) if model else None
     evaluation = evaluate(found, reference, model=line, alert_limit=alert_limit)
     if report is not None:
-        from railnav.web.report import evaluation_page
+        from railnav.web.evaluation_report import evaluation_page
 
         _files.write_text(report, evaluation_page(found, reference, evaluation, line))
     if as_json:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from railnav.errors import RailnavError
-from railnav.web.figures import INK, MODE_COLOURS, SOFT, TRACK, cross_sigma, distance_run, outline
+from railnav.web.figures import INK, MODE_COLOURS, SOFT, TRACK, cross_sigma, outline
+from railnav.web.solution_charts import distance_run
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

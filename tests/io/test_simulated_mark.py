@@ -11,7 +11,8 @@ from railnav.io.geopackage import read_model
 from railnav.io.run import read_run, write_run
 from railnav.io.solution import read_solution, write_solution
 from railnav.simulation import SERVICE, Leg, demo_line, simulate
-from railnav.web.report import SIMULATED, evaluation_page, is_simulated, solution_page
+from railnav.web.evaluation_report import evaluation_page
+from railnav.web.report import SIMULATED, is_simulated, solution_page
 
 
 @pytest.fixture(scope="module")
