@@ -63,6 +63,8 @@ class Slopes:
         Standard deviation of a run's slope error at its first node, rad.
     walk : (K,) array
         How it drifts, rad per sqrt(s).
+    broken : (K, N-1) bool array or None
+        Steps in which a run's link was found wrong: its slope error starts anew there.
     """
 
     value: FloatArray
@@ -70,6 +72,7 @@ class Slopes:
     variance: FloatArray
     first: FloatArray
     walk: FloatArray
+    broken: NDArray[np.bool_] | None = None
 
     @property
     def runs(self) -> IntArray:
@@ -79,12 +82,14 @@ class Slopes:
     def of(self, run: int) -> Slopes:
         """One run alone."""
         k = slice(run, run + 1)
-        return Slopes(self.value[k], self.lead[k], self.variance[k], self.first[k], self.walk[k])
+        broken = None if self.broken is None else self.broken[k]
+        return Slopes(self.value[k], self.lead[k], self.variance[k], self.first[k], self.walk[k], broken)
 
     def part(self, first: int, last: int) -> Slopes:
         """Nodes first..last-1."""
         k = slice(first, last)
-        return replace(self, value=self.value[:, k], lead=self.lead[:, k], variance=self.variance[:, k])
+        broken = None if self.broken is None else self.broken[:, first : last - 1]
+        return replace(self, value=self.value[:, k], lead=self.lead[:, k], variance=self.variance[:, k], broken=broken)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -263,7 +268,10 @@ def _errors(chain: Chain) -> tuple[FloatArray, FloatArray, FloatArray]:
     if chain.slopes is not None:
         runs = chain.slopes.runs
         phi = np.concatenate([phi, np.ones((len(phi), len(runs)))], axis=1)
-        drive = np.concatenate([drive, chain.slopes.walk[runs] * np.sqrt(elapsed[:, runs])], axis=1)
+        wander = chain.slopes.walk[runs] * np.sqrt(elapsed[:, runs])
+        if chain.slopes.broken is not None:
+            wander = np.where(chain.slopes.broken[runs].T, chain.slopes.first[runs], wander)
+        drive = np.concatenate([drive, wander], axis=1)
         sigma = np.concatenate([sigma, chain.slopes.first[runs]])
     return np.ascontiguousarray(phi), np.ascontiguousarray(drive), sigma
 

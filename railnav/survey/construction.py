@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from railnav.errors import RunError
 from railnav.survey import report, surveyed
 from railnav.survey.angles import slopes_of
+from railnav.survey.attribution import attribute
 from railnav.survey.axis import solve, sweep
 from railnav.survey.fixes import Fixes, gather
 from railnav.survey.joining import join_tracks
@@ -203,6 +204,7 @@ def gathered(runs: Sequence[Run], frame: GridFrame, tell: Progress) -> report.Su
                 raise RunError(cause, file=run.source or run.id)
             refused.append((run, cause))
             continue
+        found.attributed = attribute(found)
         fixes.append(found)
         courses.append(way)
     tell("gather", len(runs), len(runs))

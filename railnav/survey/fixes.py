@@ -14,6 +14,7 @@ from railnav.units import cant_angle
 if TYPE_CHECKING:
     from railnav.geodesy.grid import GridFrame
     from railnav.run import Run
+    from railnav.survey.attribution import Attributions
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -29,8 +30,9 @@ REASONS = (
     "beyond the end of the track",
     "before or after turning back",
     "contradicts the other runs here",
+    "contradicts the run's own odometer and gyroscopes",
 )
-USED, STATED_SIGMA, JUMP, FAR, GROSS, OTHER_TRACK, BEYOND, TURNED, CONTRADICTS = range(len(REASONS))
+USED, STATED_SIGMA, JUMP, FAR, GROSS, OTHER_TRACK, BEYOND, TURNED, CONTRADICTS, LINKS = range(len(REASONS))
 
 #: A fix whose stated sigma is more than this times the run's median is left out: the receiver itself doubts it.
 SIGMA_RATIO = 5.0
@@ -67,6 +69,8 @@ class Fixes:
         Where the run has gyroscopic angles: s, rad from grid north, unwrapped, and rad.
     odometer : (time, distance) arrays or None
         Where it has an odometer: s and m.
+    attributed : Attributions or None
+        What fixes and increments of the run said of each other (`railnav.survey.attribution`).
     """
 
     run: Run
@@ -82,6 +86,7 @@ class Fixes:
     right: FloatArray
     angles: tuple[FloatArray, FloatArray, FloatArray] | None = None
     odometer: tuple[FloatArray, FloatArray] | None = None
+    attributed: Attributions | None = None
 
     def __len__(self) -> int:
         return len(self.time)

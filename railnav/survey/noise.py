@@ -8,8 +8,9 @@ spectral density, the rest by one Ornstein-Uhlenbeck process of the same varianc
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,10 @@ SCALES = (0.6, 5.0)
 LAGS = (0, 1, 2, 3, 5, 8, 12, 20, 30, 50, 80, 120, 200, 300)
 #: A pair needs this many common nodes to say anything.
 FEWEST_COMMON = 30
+#: Records of fewer memories than this do not tell them; what GNSS usually has: s, and the spread of its logarithm.
+FEW, USUAL_MEMORY = 20.0, (45.0, 0.7)
+#: Nodes of a run at most that say what its frame offset took with it; by bands of lags; the share of a turned component that counts.
+MOST_KNOTS, GONE_LAGS, STRAIGHT = 150, (0, 1, 4, 10, 20, 40, 80, 160, 320), 0.02
 #: With no other run to compare with: correlation time, s, and error where the receiver states none, m.
 ASSUMED_MEMORY, ASSUMED_ERROR = 60.0, 3.0
 
@@ -48,6 +53,8 @@ class Sample:
         Fixes behind a value, usually; fixes a second.
     receiver : tuple of str
         Kind of receiver of each run.
+    design : (N, B) array or None
+        What one metre of each component of a frame offset adds to a value; ones without.
     """
 
     value: FloatArray
@@ -55,6 +62,7 @@ class Sample:
     count: FloatArray
     rate: FloatArray
     receiver: tuple[str, ...]
+    design: FloatArray | None = None
 
 
 def error_models(samples: Sequence[Sample], stated: dict[str, float]) -> tuple[dict[str, ErrorModel], set[str]]:
@@ -162,15 +170,20 @@ def run_models(sample: Sample, models: dict[str, ErrorModel]) -> list[ErrorModel
     return scaled
 
 
-def _equations(samples: Sequence[Sample], pair: tuple[str, str]) -> tuple[FloatArray, FloatArray, float, float]:
-    """Lagged products of pair differences: regressors (lags, 2 + memories), half products (lags,), fixes a value and a second."""
+def _equations(samples: Sequence[Sample], pair: tuple[str, str]) -> tuple[FloatArray, FloatArray, float, float, float]:
+    """Lagged products of pair differences: regressors (lags, 1 + memories), half products (lags,), fixes a value and a second, seconds.
+
+    The seconds are those of independent differences: K runs have K - 1.
+    """
     rows: list[FloatArray] = []
     products: list[float] = []
     weights: list[float] = []
     counts: list[float] = []
     rates: list[float] = []
+    seconds = 0.0
     for sample in samples:
         K, N = sample.value.shape
+        took: dict[int, float] = {}
         for i in range(K):
             for j in range(i + 1, K):
                 if {sample.receiver[i], sample.receiver[j]} != set(pair):
@@ -183,6 +196,9 @@ def _equations(samples: Sequence[Sample], pair: tuple[str, str]) -> tuple[FloatA
                 counts += [sample.count[i], sample.count[j]]
                 rates += [sample.rate[i], sample.rate[j]]
                 D = np.where(np.abs(D) <= 4.0 * max(spread, 1e-4), D, np.nan)
+                gone = _gone(sample, i, j, known)
+                for k in (i, j):
+                    took[k] = max(took.get(k, 0.0), float(np.ptp(sample.time[k, known])))
                 for lag in LAGS:
                     if lag >= N:
                         break
@@ -191,30 +207,62 @@ def _equations(samples: Sequence[Sample], pair: tuple[str, str]) -> tuple[FloatA
                     many = np.count_nonzero(both)
                     if many < FEWEST_COMMON:
                         continue
-                    row = np.zeros(2 + len(MEMORIES))
+                    row = np.zeros(1 + len(MEMORIES))
                     row[0] = lag == 0
-                    row[-1] = -1.0  # the mean error of a run went with its frame offset
                     for t in (sample.time[i], sample.time[j]):
                         dt = float(np.median(np.abs(t[lag:] - t[: N - lag])[both]))
-                        row[1:-1] += 0.5 * np.exp(-dt / np.array(MEMORIES))
+                        row[1:] += 0.5 * np.exp(-dt / np.array(MEMORIES))
+                    row[1:] -= gone(lag)
                     rows.append(row)
                     products.append(0.5 * float(product[both].mean()))
                     weights.append(np.sqrt(many))
+        seconds += sum(took.values()) * (1.0 - 1.0 / max(len(took), 1))
     w = np.array(weights)
-    A = np.array(rows).reshape(-1, 2 + len(MEMORIES))
+    A = np.array(rows).reshape(-1, 1 + len(MEMORIES))
     count, rate = (float(np.median(v)) if v else 1.0 for v in (counts, rates))
-    return A * w[:, None], np.array(products) * w, count, rate
+    return A * w[:, None], np.array(products) * w, count, rate, seconds
 
 
-def _fit(A: FloatArray, y: FloatArray, count: float, rate: float) -> ErrorModel:
-    """White and one correlated part, and a second, short one where it clearly helps; gathered into white and correlated."""
+def _gone(sample: Sample, i: int, j: int, known: NDArray[np.bool_]) -> Callable[[int], FloatArray]:
+    """What a frame offset fitted to the difference of two runs takes off its lagged products, by lag, for each memory.
+
+    Residuals of a fit to the design X have the covariance R - (H R + R H - H R H) with H = X (X^T X)^-1 X^T. An error that lasts as long
+    as a run goes with the offset almost whole; forgotten, the memory would come out at half and the error a third too small.
+    """
+    at = np.flatnonzero(known)
+    at = at[:: max(1, len(at) // MOST_KNOTS)]
+    X = np.ones((len(at), 1)) if sample.design is None else sample.design[at]
+    Q, R_x = np.linalg.qr(X)
+    Q = Q[:, np.abs(np.diag(R_x)) > STRAIGHT * np.abs(R_x[0, 0])]
+    apart = np.abs(at[:, None] - at)
+    order = np.argsort(apart, axis=None, kind="stable")
+    lags = apart.ravel()[order]
+    gone = []
+    for memory in MEMORIES:
+        R = np.zeros_like(apart, dtype=float)
+        for t in (sample.time[i, at], sample.time[j, at]):
+            R += 0.5 * np.exp(-np.abs(t[:, None] - t) / memory)
+        HR = Q @ (Q.T @ R)
+        gone.append((HR + HR.T - (HR @ Q) @ Q.T).ravel()[order])
+    edges = np.searchsorted(lags, [b for b in GONE_LAGS if b <= lags[-1]] + [lags[-1] + 1])
+    centre = np.array([lags[a:b].mean() for a, b in pairwise(edges) if b > a])
+    mean = np.array([[g[a:b].mean() for a, b in pairwise(edges) if b > a] for g in gone])
+    return lambda lag: np.array([float(np.interp(lag, centre, row)) for row in mean])
+
+
+def _fit(A: FloatArray, y: FloatArray, count: float, rate: float, seconds: float) -> ErrorModel:
+    """White and one correlated part, and a second, short one where it clearly helps; gathered into white and correlated.
+
+    A record that holds few memories does not tell them: then the fits of all memories are averaged, each with the weight of what GNSS
+    usually does (`USUAL_MEMORY`) and of how well it fits. The least of the misfits alone would be too sure of itself as often as not.
+    """
     from scipy.optimize import nnls
 
     memory = np.array(MEMORIES)
 
     def fit(*columns: int) -> tuple[float, FloatArray]:
-        part = np.zeros(2 + len(memory))
-        chosen = [0, *columns, len(memory) + 1]
+        part = np.zeros(1 + len(memory))
+        chosen = [0, *columns]
         part[chosen], norm = nnls(A[:, chosen], y)
         return float(norm) ** 2, part
 
@@ -222,13 +270,24 @@ def _fit(A: FloatArray, y: FloatArray, count: float, rate: float) -> ErrorModel:
     singles = [fit(j) for j in range(1, many)]
     best = min(range(len(singles)), key=lambda j: singles[j][0])
     cost, part = singles[best]
-    if best + 1 < len(singles) and singles[best + 1][0] <= NEARLY * cost:
-        part = singles[best + 1][1]  # the next longer memory fits nearly as well, and averages less
-    pairs = [fit(i, j) for i in range(1, many) for j in range(i + 2, many)]
-    cost_2, part_2 = min(pairs, key=lambda item: item[0])
-    if cost_2 < CLEARLY * cost:
-        part = part_2
-    power = part[1:-1]
+    held = 0.5 * seconds / memory[best]
+    if held < FEW:
+        usual, spread = USUAL_MEMORY
+        misfit = np.array([c for c, _ in singles])
+        score = -0.5 * ((np.log(memory / usual)) / spread) ** 2 - 0.5 * held * (
+            misfit / max(misfit.min(), 1e-300) - 1.0
+        )
+        score[memory < SHORT] = -np.inf
+        share = np.exp(score - score.max())
+        part = (share / share.sum()) @ np.array([p for _, p in singles])
+    else:
+        if best + 1 < len(singles) and singles[best + 1][0] <= NEARLY * cost:
+            part = singles[best + 1][1]  # the next longer memory fits nearly as well, and averages less
+        pairs = [fit(i, j) for i in range(1, many) for j in range(i + 2, many)]
+        cost_2, part_2 = min(pairs, key=lambda item: item[0])
+        if cost_2 < CLEARLY * cost:
+            part = part_2
+    power = part[1:]
     short = memory < SHORT
     single = part[0] * count  # a value is the mean of `count` fixes
     white = single + float((power[short] * np.maximum(1.0, 2.0 * memory[short] * rate)).sum())  # of the same density

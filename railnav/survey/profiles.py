@@ -79,6 +79,11 @@ class Profiles:
         return self.count > 0
 
 
+def passing_count(count: FloatArray) -> float:
+    """Most fixes that a node holds in an ordinary passing: their spacing does not divide the nodes' evenly, so one above the median."""
+    return float(np.median(count)) + 1.0 if len(count) else 1.0
+
+
 def profiles(traverses: Sequence[Traverse], nodes: int, step: float) -> Profiles:
     """Reduce runs to node means of their used fixes."""
     K = len(traverses)
@@ -105,8 +110,7 @@ def profiles(traverses: Sequence[Traverse], nodes: int, step: float) -> Profiles
         out.right[k] = mean(t.right[use])
         out.lead[k] = mean(t.offset[use] - node * step)
         out.sigma[k] = mean(f.sigma[use])
-        passing = max(1.0, float(np.median(count[hit])))
-        out.count[k] = np.minimum(count, passing)
+        out.count[k] = np.minimum(count, passing_count(count[hit]))
         when = mean(f.time[use])
         out.time[k] = np.interp(np.arange(nodes), np.flatnonzero(hit), when[hit])
         up = np.isfinite(f.height[use])

@@ -16,7 +16,9 @@ It is one dictionary of JSON values in `model.provenance["build"]`; an unknown n
 - `tracks`: one entry a track: `track`, `length_m`, `runs` (identifiers), `sigma_cross_m` and `sigma_cross_95_m`, `heights` (bool),
   `survey_again`: list of {`from_m`, `to_m`, `sigma_m`, `reason`}
 - `verdicts`: every gross error: `total`, and `list` of the largest (up to 300), each {`what`: "fix" | "stretch" | "link", `run`,
-  `time_s`, `track`, `offset_m`, `easting_m`, `northing_m`, `size` (m; of a link, a gyro's slope, rad), `reason`}
+  `time_s`, `track`, `offset_m`, `easting_m`, `northing_m`, `size`, `unit` ("m", or "rad" for a gyro's slope), `reason`}; where
+  fixes and increments of one run contradicted each other also `fixes` (how many), `statistic` and `limit` (chi-square) and `evidence`:
+  ln odds of this verdict over the other, of two clones
 - `repeatability`: one entry a kind of receiver: axes from single runs of different dates compared, as a histogram
   (`railnav.survey.repeatability`)
 - `warnings`: sentences in plain words
@@ -34,7 +36,7 @@ from numpy.typing import NDArray
 
 from railnav.survey.angles import slips
 from railnav.survey.axis import ErrorModel
-from railnav.survey.fixes import BEYOND, FAR, OTHER_TRACK, REASONS, TURNED, USED, Fixes
+from railnav.survey.fixes import BEYOND, FAR, LINKS, OTHER_TRACK, REASONS, TURNED, USED, Fixes
 from railnav.survey.offsets import Offsets
 from railnav.survey.repeatability import repeatability
 from railnav.survey.surveyed import Surveyed
@@ -42,6 +44,7 @@ from railnav.survey.vertical import Heights
 
 if TYPE_CHECKING:
     from railnav.run import Run
+    from railnav.survey.attribution import Attribution
     from railnav.track.alignment import KnotTable
 
 FloatArray = NDArray[np.float64]
@@ -305,26 +308,31 @@ def _verdicts(
                     "easting_m": _number(float(t.nominal.easting[node]), 2),
                     "northing_m": _number(float(t.nominal.northing[node]), 2),
                     "size": _number(size, 5),
+                    "unit": "rad",
                     "reason": "angle against the axis and its neighbours",
                 }
             )
     total = len(found)
     for i, f in enumerate(survey.fixes):
-        rows = np.flatnonzero(~np.isin(f.reason, (USED, OTHER_TRACK, TURNED)))
+        rows = np.flatnonzero(~np.isin(f.reason, (USED, OTHER_TRACK, TURNED, LINKS)))
         total += len(rows)
+        name, offset = place.get(i, ("", np.full(len(f), np.nan)))
+        offset = offset if len(offset) == len(f) else np.full(len(f), np.nan)
+        if f.attributed is not None:
+            total += len(f.attributed.found)
+            found += [_attributed(f, a, name, offset) for a in f.attributed.found]
         for j in rows[np.argsort(-f.size[rows], kind="stable")[:MOST_VERDICTS]]:
-            name, offset = place.get(i, ("", np.full(len(f), np.nan)))
-            at = float(offset[j]) if len(offset) == len(f) else np.nan
             found.append(
                 {
                     "what": "fix",
                     "run": f.run.id,
                     "time_s": _number(f.time[j], 3),
                     "track": name,
-                    "offset_m": _number(at, 1),
+                    "offset_m": _number(offset[j], 1),
                     "easting_m": _number(f.easting[j], 2),
                     "northing_m": _number(f.northing[j], 2),
                     "size": _number(f.size[j], 2),
+                    "unit": "m",
                     "reason": REASONS[f.reason[j]],
                 }
             )
@@ -340,12 +348,39 @@ def _verdicts(
                     "offset_m": part["from_m"],
                     "to_m": part["to_m"],
                     "size": part["distance_m"],
+                    "unit": "m",
                     "reason": REASONS[OTHER_TRACK],
                 }
             )
     order = {"stretch": 0, "link": 1, "fix": 2}
     found.sort(key=lambda v: (order[v["what"]], -abs(v["size"] or 0.0)))
     return {"total": total, "list": found[:MOST_VERDICTS]}
+
+
+def _attributed(f: Fixes, a: Attribution, track: str, offset: FloatArray) -> dict[str, Any]:
+    """One contradiction of fixes and increments as a verdict; its place is that of the fix at which it showed."""
+    at = a.first if a.wrong == "fix" else a.last
+    # a fix that is not used is not laid: its place is between its neighbours
+    known = np.flatnonzero(np.isfinite(offset))
+    here = float(np.interp(at, known, offset[known])) if len(known) else np.nan
+    return {
+        "what": a.wrong,
+        "run": f.run.id,
+        "time_s": _number(a.time, 3),
+        "track": track,
+        "offset_m": _number(here, 1),
+        "easting_m": _number(f.easting[at], 2),
+        "northing_m": _number(f.northing[at], 2),
+        "size": _number(a.size, 3),
+        "unit": "m",
+        "reason": REASONS[LINKS]
+        if a.wrong == "fix"
+        else "odometer or gyroscope contradicts the fixes before and after",
+        "fixes": a.last - a.first + 1 if a.wrong == "fix" else 0,
+        "statistic": _number(a.statistic, 1),
+        "limit": _number(a.limit, 1),
+        "evidence": _number(a.evidence, 1),
+    }
 
 
 def _residuals(t: Surveyed, k: int, offsets: Offsets) -> FloatArray:
@@ -506,6 +541,7 @@ def _warnings(
             f"no two runs of one track let the errors of {', '.join(sorted(survey.assumed))} be checked: they are assumed from the "
             "stated sigmas"
         )
+    out += [f"run {f.run.id}: {f.attributed.unsure}" for f in survey.fixes if f.attributed and f.attributed.unsure]
     leaning = [f for f in survey.fixes if f.run.gnss is not None and abs(f.run.gnss.lever_arm_b[2]) > LEAN_HEIGHT]
     leaning = [f for f in leaning if f.angles is None and (f.run.gauge is None or f.run.gauge.cant is None)]
     if leaning:

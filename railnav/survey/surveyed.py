@@ -232,10 +232,11 @@ def reduced(track: Surveyed, offset: FloatArray, step: float, receivers: list[st
         value[k, hit] = np.bincount(node, weights=residual, minlength=many)[hit] / count[hit]
         when = np.bincount(node, weights=t.fixes.time[use], minlength=many)[hit] / count[hit]
         time[k] = np.interp(np.arange(many), np.flatnonzero(hit), when)
-        usual[k] = np.median(count[hit])
+        usual[k] = 1.0 / np.mean(1.0 / count[hit])  # the variance of a mean, on average
         rate[k] = 1.0 / max(float(np.median(np.diff(t.fixes.time[use]))), 1e-3) if len(use) > 1 else 1.0
     kinds = tuple(receivers[i] for i in track.runs) if receivers is not None else ("",) * K
-    return Sample(value, time, usual, rate, kinds)
+    node = np.minimum(np.arange(many) * step / nominal.step, len(nominal) - 1).astype(np.int64)
+    return Sample(value, time, usual, rate, kinds, np.column_stack([e[node], n[node]]))
 
 
 def relaid(track: Surveyed, fixes: Sequence[Fixes], *, step: float | None = None) -> Surveyed:

@@ -40,7 +40,7 @@ def survey_sections(build: Mapping[str, Any]) -> list[Section]:
     ]
     if again:
         many = f"The first {MOST_ROWS} of {len(again)}." if len(again) > MOST_ROWS else ""
-        columns = ("track", "why", "from, m", "to, m", "largest sigma")
+        columns: tuple[str, ...] = ("track", "why", "from, m", "to, m", "largest sigma")
         sections.append(Section("Where to survey again", many, [Table(columns, again[:MOST_ROWS], 2)]))
     verdicts = build.get("verdicts") or {}
     if verdicts.get("list"):
@@ -48,16 +48,19 @@ def survey_sections(build: Mapping[str, Any]) -> list[Section]:
             (
                 v["what"], str(v["run"]), str(v["track"]), str(v["reason"]), "" if v["time_s"] is None else f"{v['time_s']:.1f}",
                 "" if v["offset_m"] is None else f"{v['offset_m']:.0f}" + (f" to {v['to_m']:.0f}" if "to_m" in v else ""),
-                "" if v["size"] is None else f"{v['size']:.4f} rad" if v["what"] == "link" else words.length(v["size"], 3),
+                "" if v["size"] is None else f"{v['size']:.4f} rad" if v.get("unit") == "rad" else words.length(v["size"], 3),
+                "" if v.get("evidence") is None else f"{v['evidence']:.0f}",
             )
             for v in verdicts["list"][:MOST_ROWS]
         ]  # fmt: skip
-        columns_6 = ("what", "run", "track", "why", "time, s", "offset, m", "size")
+        columns = ("what", "run", "track", "why", "time, s", "offset, m", "size", "evidence")
         sections.append(
             Section(
                 "Gross errors",
-                f"The largest of {verdicts['total']:,}: fixes, stretches on another track, and links (angles). None of them is used.",
-                [Table(columns_6, rows, 4)],
+                f"The largest of {verdicts['total']:,}: fixes, stretches on another track, and links (angles, odometer). None of them is "
+                "used. Where fixes and increments of one run contradict each other, two clones of its filter went on, one without the "
+                "fix, one without the link: evidence is the logarithm of the odds of what is said over the other.",
+                [Table(columns, rows, 4)],
             )
         )
     found = build.get("repeatability") or []
