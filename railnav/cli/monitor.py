@@ -154,7 +154,7 @@ def command(
     if list_file is not None:
         from railnav.io.geometry import write_exceedances
 
-        write_exceedances(found, list_file)
+        write_exceedances(found, list_file, model=report.model)
     if quality is not None:
         from railnav.io.geometry import write_quality
 

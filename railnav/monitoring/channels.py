@@ -144,7 +144,7 @@ def channels_of(recording: Recording, *, bases: Sequence[float] = TWIST_BASES) -
         gauge = series["gauge"]
         add("gauge", "Gauge", "m", gauge.values, gauge.noise, gauge)
     else:
-        refused["gauge"] = "the run has no gauge stream"
+        refused["gauge"] = recording.refused.get("gauge", "the run has no gauge stream")
     _cross_level(recording, bases, channels, refused)
     _bands(recording, channels, refused)
     rails, without = rail_channels(recording, channels)

@@ -13,8 +13,9 @@ from click.testing import CliRunner
 from railnav.cli import main
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "monitoring"))
-from recorded import TRACK, line, recorded
+from recorded import TRACK, design_of, line, recorded
 
+from railnav.io.designs import write_designs
 from railnav.io.run import write_run
 
 
@@ -185,6 +186,90 @@ def test_contradictory_fixed_points_are_named_on_one_line(cars, tmp_path):
     assert "'bridge B' at 1005.0 m" in err
     assert "platform" not in err
     assert not (tmp_path / "plan.csv").exists()
+
+
+def test_a_design_that_misses_the_axis_by_metres_is_one_line_with_the_place(cars, tmp_path):
+    write_designs([design_of(line(), 3.5, 900.0)], tmp_path / "design.xml")
+    words = [
+        "lining",
+        cars / "car-1",
+        "-m",
+        cars / "line.gpkg",
+        "-o",
+        tmp_path / "plan.csv",
+        "--design",
+        tmp_path / "design.xml",
+    ]
+    code, _, err = run(*words)
+    assert code == 1
+    assert err.count("\n") == 1
+    assert "design 'design' misses the measured axis by 3." in err
+    assert f"on track '{TRACK}' at " in err
+    assert not (tmp_path / "plan.csv").exists()
+
+
+def test_of_several_designs_the_one_meant_is_named(cars, tmp_path):
+    from dataclasses import replace
+
+    ours, older = design_of(line(), 0.0, 700.0), replace(design_of(line(), 0.15, 700.0), track="older")
+    write_designs([ours, older], tmp_path / "designs.csv")
+    words = [
+        "lining",
+        cars / "car-1",
+        "-m",
+        cars / "line.gpkg",
+        "-o",
+        tmp_path / "plan.csv",
+        "--design",
+        tmp_path / "designs.csv",
+    ]
+    code, _, err = run(*words)
+    assert code == 1
+    assert err.count("\n") == 1
+    assert "all lie along section" in err
+    code, out, err = run(*words, "--alignment", "design", "--json")
+    assert code == 0, err
+    facts = json.loads(out)
+    assert facts["design"] == "design"
+    assert facts["versine_method"]["spread_mm"]
+    code, _, err = run(*words, "--alignment", "newer")
+    assert (code, err.count("\n")) == (1, 1)
+    assert "there is no design 'newer'; there are 'design', 'older'" in err
+
+
+def test_gauge_outliers_are_counted_and_a_broken_gauge_stream_is_not_used(cars, tmp_path):
+    from dataclasses import replace
+
+    import numpy as np
+
+    car = recorded(1)
+    wild = car.gauge.gauge.copy()
+    wild[5000:5030] = 1.9
+    write_run(replace(car, id="wild", gauge=replace(car.gauge, gauge=wild)), tmp_path / "wild")
+    code, out, err = run("monitor", tmp_path / "wild", "-m", cars / "line.gpkg", "-o", tmp_path / "g.html", "--json")
+    assert code == 0, err
+    part = json.loads(out)["sections"][0]["runs"][0]
+    assert any("gauge: 30 samples outside 1395 to 1515 mm" in note for note in part["notes"])
+    assert part["channels"]["gauge"]["judged"]
+    noise = np.random.default_rng(1).uniform(1.2, 1.9, len(wild))
+    write_run(replace(car, id="broken", gauge=replace(car.gauge, gauge=noise)), tmp_path / "broken")
+    code, out, err = run("monitor", tmp_path / "broken", "-m", cars / "line.gpkg", "-o", tmp_path / "g.html", "--json")
+    assert code == 0, err
+    part = json.loads(out)["sections"][0]["runs"][0]
+    assert "of the gauge samples lie outside" in part["refused"]["gauge"]
+    assert "of the gauge samples lie outside" in part["refused"]["alignment_left_d1"]
+    assert "alignment_d1" in part["channels"]
+
+
+def test_a_run_that_covers_a_part_of_the_section_is_said(cars, tmp_path):
+    section = ["--tracks", f"{TRACK}"]
+    code, _, err = run("monitor", cars / "car-1", "-m", cars / "line.gpkg", "-o", tmp_path / "g.html", *section)
+    assert code == 0
+    assert "covers 3000 m" in err
+    assert f"of the {line().length(TRACK):.0f} m asked for" in err
+    code, _, err = run("lining", cars / "car-1", "-m", cars / "line.gpkg", "-o", tmp_path / "p.csv", *section)
+    assert code == 0
+    assert "the runs leave gaps beyond" in err
 
 
 def test_usage_that_cannot_be_meant(cars, tmp_path):
