@@ -544,11 +544,11 @@ def _cant(model: TrackModel, name: str, side: Side | None, old: int, nodes: int)
 def with_tables(
     model: TrackModel, tables: dict[str, KnotTable], provenance: dict[str, Any], records: ModelRecords | None
 ) -> TrackModel:
-    """The model with some of its tracks tabulated anew; mile posts and nodes go with them."""
+    """The model with some of its tracks tabulated anew; mile posts, line references and nodes go with them."""
     from railnav.track.model import KNOT_COLUMNS, MilePosts
 
     columns: dict[str, list[FloatArray]] = {c: [] for c in (*KNOT_COLUMNS, "covariance_g")}
-    posts = np.array(model.mileposts.offset)
+    posts, anchors = np.array(model.mileposts.offset), np.array(model.references.offset)
     sizes = []
     for i, name in enumerate(model.track_id):
         part = model.knots(name)
@@ -559,6 +559,7 @@ def with_tables(
         if table is not None:
             here = model.mileposts.track == i
             posts[here] *= table.offset[-1] / model.offset[part][-1]
+            anchors[model.references.track == i] *= table.offset[-1] / model.offset[part][-1]
     start = np.append(0, np.cumsum(sizes)).astype(np.int64)
     knots: dict[str, Any] = {c: np.concatenate(pieces) for c, pieces in columns.items()}
     nodes = model.nodes
@@ -581,6 +582,7 @@ def with_tables(
             height=np.where(fresh, place[:, 2], nodes.height),
         ),
         mileposts=MilePosts(model.mileposts.track, posts, model.mileposts.chainage),
+        references=replace(model.references, offset=anchors),
         provenance=provenance,
         record_source=None if records is None else lambda: records,
     )
