@@ -131,6 +131,7 @@ def update(
     if not runs:
         raise RunError("no runs to update with", remedy="give one folder or more, each a drive with GNSS")
     _refuse_known(runs, records)
+    _refuse_other_datum(model, runs)
     lines = stored_lines(model, records)
     survey = gathered(runs, model.frame, tell)
     for run, cause in survey.refused:
@@ -165,6 +166,20 @@ def update(
 
 def _silent(stage: str, done: int, total: int) -> None:
     pass
+
+
+def _refuse_other_datum(model: TrackModel, runs: Sequence[Run]) -> None:
+    """A model that is fixed to a datum takes runs that are carried to it, and no others."""
+    datum = str(model.provenance.get("fixed_to", ""))
+    for run in runs:
+        if run.gnss is not None and run.gnss.fixed_to != datum:
+            carried = f"is fixed to {run.gnss.fixed_to}" if run.gnss.fixed_to else "is fixed to no datum"
+            raise RunError(
+                f"{carried}, the model {f'to {datum}' if datum else 'to none'}",
+                file=run.source or run.id,
+                column="gnss.fixed_to",
+                remedy=f'write fixed_to = "{datum}" in run.toml' if datum else "build the model anew with it",
+            )
 
 
 def _check_plane(model: TrackModel, crs: str | None) -> None:
