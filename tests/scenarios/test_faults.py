@@ -16,7 +16,6 @@ from railnav.simulation.faults import Fault
 NOT_YET = {
     "balise-misnamed",
     "gnss-ramp-along-0.1",
-    "gnss-ramp-along-0.5",
     "gnss-ramp-left-0.5",
     "gnss-sigma-third",
     "gnss-frame-9m-south",
