@@ -233,6 +233,8 @@ LEAVING = 0.08
 KICK = 0.7
 #: Random walk of the speed while an accelerometer that should be there is silent, m/s^2/sqrt(Hz).
 SILENT_NOISE = 0.4
+#: How long a jump of the stamps is remembered where nothing but the fixes tells the time, s: loggers that lose a stamp find it again.
+TAG_MEMORY = 300.0
 #: Squared normalised innovation at which a single sensor row is held; its evidence saturates there.
 ROW_GATE = 16.0
 #: ln p of a balise that a hypothesis has no explanation for: read in error, or its place in the model is wrong.

@@ -140,7 +140,16 @@ from railnav.navigation.columns import (
     WHEEL_SPEED,
     YAW_RATE,
 )
-from railnav.navigation.dynamics._kernels import absorb, project, robust_row, variance_of, widen
+from railnav.navigation.dynamics._kernels import (
+    absorb,
+    project,
+    robust_row,
+    stamps,
+    take_back,
+    timed,
+    variance_of,
+    widen,
+)
 from railnav.units import RAIL_CENTRE_DISTANCE
 
 
@@ -548,7 +557,10 @@ def course_row(fil, shared, bank, work, h, row, sign, sigma):
     doubt = project(P_sqrt, h_row, f) + variance + (speed * doubt) ** 2
     said = min(across * across / doubt, ROW_GATE) + log_once(doubt, alike * turned * turned, alike)
     credit(bank, h, BY_COURSE, -0.5 * said)
+    before = stamps(fil, x, P_sqrt)
     robust_row(x, P_sqrt, h_row, across, variance, f, keep, move)
+    if not timed(fil):
+        take_back(fil, x, P_sqrt, before, work.vector[W_COLUMN])
     h_row[i_t] = 0.0
     h_row[i_s] = 0.0
 
@@ -569,7 +581,10 @@ def speed_rows(fil, shared, bank, work, h, row):
     v = x[i_v]
     if speed < 4.0 * sigma and abs(v) < 8.0 * sigma:  # near standstill the sign is not told
         h_row[i_v] = 1.0
+        before = stamps(fil, x, P_sqrt)
         credit(bank, h, BY_SPEED, robust_row(x, P_sqrt, h_row, -v, speed * speed + sigma * sigma, f, keep, move))
+        if not timed(fil):
+            take_back(fil, x, P_sqrt, before, work.vector[W_COLUMN])
         h_row[i_v] = 0.0
         return
     certain = v * v > 25.0 * variance_of(P_sqrt, i_v) and abs(v) > 3.0
@@ -599,7 +614,10 @@ def speed_rows(fil, shared, bank, work, h, row):
     h_row[i_l] = -sign * a
     h_row[i_e] = share
     innovation = speed - sign * (v - x[i_l] * a) - share * x[i_e]
+    before = stamps(fil, x, P_sqrt)
     credit(bank, h, BY_SPEED, robust_row(x, P_sqrt, h_row, innovation, sigma * sigma, f, keep, move))
+    if not timed(fil):
+        take_back(fil, x, P_sqrt, before, work.vector[W_COLUMN])
     h_row[i_v] = 0.0
     h_row[i_l] = 0.0
     h_row[i_e] = 0.0
@@ -622,6 +640,7 @@ def motion_rows(fil, net, shared, bank, work, h, row, dt, still):
         i_v = at[SPEED]
         h_row[i_v] = 1.0
         variance = fil.settings[K_STILL_SIGMA] ** 2
+        before = stamps(fil, bank.x[h], bank.P_sqrt[h])
         rest = robust_row(
             bank.x[h],
             bank.P_sqrt[h],
@@ -632,6 +651,8 @@ def motion_rows(fil, net, shared, bank, work, h, row, dt, still):
             work.vector[W_KEEP],
             work.vector[W_MOVE],
         )
+        if not timed(fil):
+            take_back(fil, bank.x[h], bank.P_sqrt[h], before, work.vector[W_COLUMN])
         credit(bank, h, BY_STANDSTILL, rest)
         h_row[i_v] = 0.0
     if at[GYRO_BIAS] >= 0 and dt > 0.0 and (row[YAW_RATE] == row[YAW_RATE] or row[SIDE] == row[SIDE]):
