@@ -176,6 +176,8 @@ def command(
 
 def facts(plan: LiningPlan) -> dict[str, Any]:
     """The plan as plain facts."""
+    from math import isfinite
+
     return {
         "section": plan.section.name,
         "length_m": float(plan.distance[-1] - plan.distance[0]),
@@ -191,6 +193,10 @@ def facts(plan: LiningPlan) -> dict[str, Any]:
         "greatest_lift_mm": 1e3 * float(plan.lift.max()),
         "sigma_slew_mm": 1e3 * float(max(plan.sigma_slew)),
         "spread_mm": {f"{name} {band}": [1e3 * a, 1e3 * b] for (name, band), (a, b) in plan.spread.items()},
+        "bears": {
+            f"{name} {band}": {"sigma_mm": 1e3 * sigma if isfinite(sigma) else None, "borne": good}
+            for (name, band), (sigma, good) in plan.bears.items()
+        },
         "versine_method": {
             "greatest_slew_mm": 1e3 * float(abs(plan.hallade_slew).max()) if len(plan.hallade_slew) else None,
             "spread_mm": {f"{name} {band}": [1e3 * a, 1e3 * b] for (name, band), (a, b) in plan.hallade_spread.items()},
@@ -224,7 +230,10 @@ def _print(plan: LiningPlan) -> None:
             f"{1e3 * before:.2f} mm",
             f"{1e3 * after:.2f} mm",
             f"{1e3 * strings[name, band][1]:.2f} mm" if (name, band) in strings else "",
+            "yes" if plan.bears[name, band][1] else "no",
         ]
         for (name, band), (before, after) in plan.spread.items()
     ]
-    print_table("Standard deviation", ("channel", "band", "before", "after", "by versines"), rows, left=2)
+    print_table(
+        "Standard deviation", ("channel", "band", "before", "after", "by versines", "axis bears it"), rows, left=2
+    )

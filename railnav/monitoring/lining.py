@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from railnav.errors import TrackError
 from railnav.monitoring.design import Design
 from railnav.monitoring.filters import D1, D2, D3_ALIGNMENT, D3_LEVEL, Band, band_pass, low_pass, stretches
-from railnav.monitoring.position import MeasuredAxis, shape_sigma
+from railnav.monitoring.limits import FINE_ENOUGH
+from railnav.monitoring.position import MeasuredAxis, band_sigma, shape_sigma
 from railnav.monitoring.section import Section
 from railnav.monitoring.smoothing import Bounds, FixedPoint, InfeasibleError, corrections, whittaker
 from railnav.monitoring.target import SHORTEST, level_above, target_along
@@ -84,6 +85,9 @@ class LiningPlan:
         shape where the target is smoothed out of the axis itself. Neighbours share most of it.
     spread : mapping of (str, str) to (float, float)
         Standard deviation before and after by channel ("alignment", "longitudinal_level") and band, m.
+    bears : mapping of (str, str) to (float, bool)
+        By channel and band: sigma that the axis has there by the noise of its sensors, m (NaN where that is not known), and whether it
+        bears corrections in that band: the sigma is at most a third of what was found there.
     measured : MeasuredAxis
     design : str
         The design's track; empty for a smoothed target.
@@ -114,6 +118,7 @@ class LiningPlan:
     sigma_slew: FloatArray
     sigma_lift: FloatArray
     spread: Mapping[tuple[str, str], tuple[float, float]]
+    bears: Mapping[tuple[str, str], tuple[float, bool]]
     measured: MeasuredAxis
     design: str
     cutoff: float
@@ -264,6 +269,8 @@ def line_up(
             (measured.noise_up, measured.relative_up),
         )
     ]
+    bears = _bears(measured, spread)
+    notes += _said(bears)
     if not (measured.sigma_right <= USABLE):
         notes.append("not for a machine: the axis is not known well enough for slews of millimetres")
     return LiningPlan(
@@ -287,6 +294,7 @@ def line_up(
         sigma_slew=_sigma(measured.sigma_right, shape[0], measured.local_right, rows, bool(name))[nodes],
         sigma_lift=_sigma(measured.sigma_up, shape[1], measured.local_up, rows, not free_level)[nodes],
         spread=spread,
+        bears=bears,
         measured=measured,
         design=name,
         cutoff=math.nan if name else cutoff,
@@ -333,7 +341,10 @@ def _corrected(
         if measured.sigma_right <= USABLE:
             raise
         known = f"to {measured.sigma_right:.2f} m" if math.isfinite(measured.sigma_right) else "with no stated accuracy"
-        raise InfeasibleError(f"{error}; note that the axis is only known {known}, too coarse for lining") from error
+        raise InfeasibleError(
+            f"{error}; note that the axis is only known {known}, too coarse for lining; slews of a metre, a curvature rate "
+            "of 1e-4 1/m^2 and a cut-off of 500 m show the method on such data"
+        ) from error
 
 
 def _longest(measured: MeasuredAxis, notes: list[str]) -> slice:
@@ -396,6 +407,32 @@ def _spread(
             if step <= band.lower / 3.0 and len(values) * step > 4.0 * band.upper:
                 found[name, band.name] = (_sd(values, step, band), _sd(values + change, step, band))
     return found
+
+
+def _bears(
+    measured: MeasuredAxis, spread: Mapping[tuple[str, str], tuple[float, float]]
+) -> dict[tuple[str, str], tuple[float, bool]]:
+    """Sigma of the axis in each band, and whether it bears corrections there."""
+    found = {}
+    for name, bands, noise in (
+        ("alignment", (D1, D2, D3_ALIGNMENT), measured.noise_right),
+        ("longitudinal_level", (D1, D2, D3_LEVEL), measured.noise_up),
+    ):
+        for band in bands:
+            if (name, band.name) in spread:
+                sigma = band_sigma(noise, band)
+                found[name, band.name] = (sigma, sigma <= FINE_ENOUGH * spread[name, band.name][0])
+    return found
+
+
+def _said(bears: Mapping[tuple[str, str], tuple[float, bool]]) -> list[str]:
+    """Which bands the accuracy of the axis allows, in words, where it does not allow all."""
+    if not bears or all(good for _, good in bears.values()):
+        return []
+    words = {key: f"{key[0].replace('_', ' ')} {key[1]}" for key in bears}
+    allowed = ", ".join(words[key] for key, (_, good) in bears.items() if good) or "none of the bands up to 200 m"
+    wanting = ", ".join(words[key] for key, (_, good) in bears.items() if not good)
+    return [f"the accuracy of the axis allows corrections in {allowed}; in {wanting} they follow noise"]
 
 
 def _sd(values: FloatArray, step: float, band: Band) -> float:

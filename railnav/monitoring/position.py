@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railnav.errors import TrackError
-from railnav.monitoring.filters import band_noise, low_pass, stretches
+from railnav.monitoring.filters import Band, band_noise, gain, low_pass, stretches
 from railnav.monitoring.recording import Recording, Series
 from railnav.monitoring.section import Section
 
@@ -76,17 +76,27 @@ def shape_sigma(noise: Sequence[AxisNoise], cutoff: float) -> float:
     >>> bool(shape_sigma([angles], 100.0) < 0.2e-3 < 2e-3 < shape_sigma([AxisNoise(0.02, 30.0, 0.0, 0.0, 90.0)], 100.0))
     True
     """
+    f = np.geomspace(1.0 / (20.0 * cutoff), 1.0 / 3.0, 2000)
+    return _through(noise, f, 1.0 - 1.0 / (1.0 + (cutoff * f) ** 6))
+
+
+def band_sigma(noise: Sequence[AxisNoise], band: Band) -> float:
+    """Standard deviation that runs leave in an axis within a band, m; NaN without runs: `shape_sigma` with the band's gain for 1 - S."""
+    f = np.geomspace(1.0 / (4.0 * band.upper), 4.0 / band.lower, 2000)
+    return _through(noise, f, gain(1.0 / f, band))
+
+
+def _through(noise: Sequence[AxisNoise], f: FloatArray, passed: FloatArray) -> float:
+    """Sigma of the noise through a filter of given gain at frequencies, 1/m."""
     if not noise:
         return math.nan
-    f = np.geomspace(1.0 / (20.0 * cutoff), 1.0 / 3.0, 2000)
-    past = 1.0 - 1.0 / (1.0 + (cutoff * f) ** 6)
     total = 0.0
     for one in noise:
         low = 0.5 ** ((one.crossover * f) ** 2)
         density = 2.0 * one.position**2 * one.position_spacing * low**2
         if one.angle_spacing > 0.0:
             density = density + 2.0 * one.angle**2 * one.angle_spacing * ((1.0 - low) / (2.0 * np.pi * f)) ** 2
-        total += one.share**2 * float(np.trapezoid(past**2 * density, f))
+        total += one.share**2 * float(np.trapezoid(passed**2 * density, f))
     return math.sqrt(total)
 
 
@@ -263,8 +273,6 @@ def _joined(recording: Recording, position: str, angle: str) -> _Part | None:
         s = np.arange(b - a, dtype=float)
         integral -= np.polyval(np.polyfit(s, integral, 1), s)
         shape[a:b] = integral - low_pass(integral, recording.step, wave)
-    from railnav.monitoring.filters import Band
-
     relative = band_noise(turn.noise, turn.spacing, Band("shape", 3.0, wave), integrate=1)
     # of the positions' noise about a third lies in waves up to the crossover, where the smoothing lets go
     relative = math.hypot(relative, white / 3.0)

@@ -46,6 +46,7 @@ ORDER = (
     "alignment_d1",
     "alignment_d2",
     "alignment_d3",
+    "versine_",
     "plan_deviation",
     "height_deviation",
 )

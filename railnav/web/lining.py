@@ -170,15 +170,18 @@ def _spread(plan: LiningPlan) -> Section:
             f"{1e3 * before:.2f}",
             f"{1e3 * after:.2f}",
             f"{1e3 * strings[name, band][1]:.2f}" if (name, band) in strings else "",
+            f"{1e3 * plan.bears[name, band][0]:.3f}" if np.isfinite(plan.bears[name, band][0]) else "not known",
+            "yes" if plan.bears[name, band][1] else "no",
         ]
         for (name, band), (before, after) in plan.spread.items()
     ]
     text = (
         "Standard deviation over the stretch, mm, of what was measured and of what is planned (the machine's own errors are not in it). "
         "By versines: what the classic method on half chords of 10 m would leave; it keeps no limits but the ends, and its slews drift "
-        "where small errors of versines add up."
+        "where small errors of versines add up. The axis bears corrections in a band where the noise of its sensors there is at most "
+        "a third of what was found."
     )
-    columns = ("channel", "band", "before", "after", "by versines")
+    columns = ("channel", "band", "before", "after", "by versines", "sigma of the axis", "axis bears it")
     return Section("Before and after", text, [Table(columns, rows, left=2)] if rows else [])
 
 

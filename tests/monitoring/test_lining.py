@@ -13,7 +13,7 @@ from railnav.errors import InputError, TrackError
 from railnav.io.lining import read_fixed_points, write_plan
 from railnav.monitoring.filters import D1, D2, D3_ALIGNMENT, band_pass
 from railnav.monitoring.lining import LiningLimits, line_up
-from railnav.monitoring.position import MeasuredAxis, measured_axis
+from railnav.monitoring.position import MeasuredAxis, band_sigma, measured_axis
 from railnav.monitoring.recording import record
 from railnav.monitoring.section import onto, passages_of, section_of
 from railnav.monitoring.smoothing import Bounds, FixedPoint, InfeasibleError, corrections, feasible, whittaker
@@ -307,6 +307,34 @@ def test_sigmas_follow_the_number_of_runs_and_the_kind_of_target():
     smooth, design = line_up(made), line_up(made, designs=[design_of(line(), 0.0, 520.0)])
     assert design.sigma_slew[[5, -5]] == pytest.approx([0.005, 0.01])
     assert smooth.sigma_slew[[5, -5]] == pytest.approx([1e-4, 2e-4])
+
+
+def test_the_plan_says_which_bands_the_accuracy_of_the_axis_allows():
+    made = measured_axis(section(), [recording(1)])
+    fine = line_up(made)
+    assert all(good and sigma < 1e-3 for sigma, good in fine.bears.values())
+    assert not [note for note in fine.notes if "accuracy of the axis" in note]
+    coarse = tuple(replace(noise, angle=200.0 * noise.angle) for noise in made.noise_right)
+    plan = line_up(replace(made, noise_right=coarse))
+    assert not plan.bears["alignment", "D3"][1]
+    assert plan.bears["longitudinal_level", "D1"][1]
+    assert any("allows corrections in" in note and "in alignment" in note for note in plan.notes)
+    model = line_up(replace(made, noise_right=(), noise_up=()))
+    assert not any(good for _, good in model.bears.values())
+    assert any("in none of the bands up to 200 m" in note for note in model.notes)
+
+
+def test_the_axis_is_as_noisy_in_each_band_as_it_says():
+    """Errors of the measured shape against the simulated one, band by band, over runs; the stated sigma counts the roughness of the
+    track within three samples as noise, so it may be larger, and is never half."""
+    for band in (D1, D2, D3_ALIGNMENT):
+        ratio = []
+        for seed in (1, 2, 3):
+            made = measured_axis(section(), [recording(seed)])
+            which, offset = made.section.locate(made.distance)
+            error = band_pass(made.right - fields().at(which, offset)[:, 0], made.step, band)
+            ratio.append(np.nanstd(error) / band_sigma(made.noise_right, band))
+        assert 0.3 < np.mean(ratio) < 1.6, f"{band.name}: {ratio}"
 
 
 def test_fixed_points_off_the_stretch_are_said():
