@@ -331,9 +331,13 @@ def _assembled(
     if joins:
         text["parts"] = parts
         text["warnings"].append(
-            f"runs part in {len(joins)} places: turnouts were made there, and their tracks meet in nodes; such a model carries no survey "
-            "records, build it from all runs when there are new ones"
+            f"runs part in {len(joins)} places: turnouts were made there, and their tracks meet in nodes"
         )
-        return assemble(frame, sections, join_within=0.05, provenance={**provenance, "build": text})
-    records = keep_build(survey, tracks, offsets, heights, up)
-    return assemble(frame, sections, provenance={**provenance, "build": text}, record_source=lambda: records)
+    records = keep_build(survey, tracks, joins, parts, offsets, heights, up)
+    return assemble(
+        frame,
+        sections,
+        join_within=0.05 if joins else 0.5,
+        provenance={**provenance, "build": text},
+        record_source=lambda: records,
+    )
