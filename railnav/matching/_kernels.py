@@ -35,8 +35,7 @@ def source_stamp(*modules: ModuleType) -> int:
 
 #: Columns of a packed knot: one cache line of eight doubles. Tangents are grid metres per metre of offset.
 OFFSET, EAST, NORTH, D_EAST, D_NORTH, CURVATURE, GRADIENT, CANT = range(8)
-#: Columns of an evaluated point of a path: as a knot without its offset, d(gradient)/ds, the model's sigma across the track, m, d(cant)/ds,
-#: sigma of its curvature, 1/m.
+#: Columns of an evaluated point of a path: as a knot without its offset, d(gradient)/ds, the model's sigma across the track, m, d(cant)/ds.
 (
     P_EAST,
     P_NORTH,
@@ -48,19 +47,20 @@ OFFSET, EAST, NORTH, D_EAST, D_NORTH, CURVATURE, GRADIENT, CANT = range(8)
     P_GRADIENT_RATE,
     P_SIGMA_CROSS,
     P_CANT_RATE,
-    P_SIGMA_BEND,
-) = range(11)
-POINT_SIZE = 11
+) = range(10)
+POINT_SIZE = 10
 #: Integer marks of a hypothesis.
 COUNT, CURRENT, RECORD, VERSION, MOVED, SIGN = range(6)
 TAGS = 6
 #: Real-valued marks of a hypothesis: time the slip began (-inf: none), time since when the wheel agrees again, evidence that fades, how
-#: much of it is believed, path coordinate up to which balises are accounted for; then its ledger, what each kind of evidence has added
-#: to its log-weight.
-SLIP_SINCE, AGREE_SINCE, FADING, BELIEVED, PASSED = range(5)
+#: much of it is believed, path coordinate up to which balises are accounted for; the evidence that fades if the receiver has gone astray,
+#: its error across the track then, m, and that error's variance (negative: not known yet); the same if the run's frame is off from the
+#: start; then its ledger, what each kind of evidence has added to its log-weight.
+SLIP_SINCE, AGREE_SINCE, FADING, BELIEVED, PASSED, ASTRAY, ASTRAY_CROSS, ASTRAY_VARIANCE = range(8)
+FRAMED, FRAMED_CROSS, FRAMED_VARIANCE = range(8, 11)
 #: Dead reckoning by the wheel from a while ago: when it began, place, wheel distance and scale then, variances of place and scale; twice,
 #: the older one in use.
-CHECK = 5
+CHECK = 11
 CHECK_SIZE = 6
 CHECK_TIME, CHECK_PLACE, CHECK_WHEEL, CHECK_SCALE, CHECK_VARIANCE, CHECK_SCALE_VARIANCE = range(6)
 LEDGER = CHECK + 2 * CHECK_SIZE
@@ -86,7 +86,6 @@ class Network(NamedTuple):
 
     knots: FloatArray  # (k, 8)
     sigma_cross: FloatArray  # (k,) m, 0 where the model states none
-    sigma_bend: FloatArray  # (k,) of the curvature, 1/m
     knot_start: IntArray  # (t + 1,)
     length: FloatArray  # (t,) m
     move_start: IntArray  # (2 t + 1,) CSR pointer by track end 2 * track + end
@@ -156,7 +155,6 @@ def track_point(net, track, way, local, out):  # m from the entering end -> out 
     out[P_GRADIENT] = sign * (v * knots[j, GRADIENT] + u * knots[j + 1, GRADIENT])
     out[P_CANT] = sign * (v * knots[j, CANT] + u * knots[j + 1, CANT])
     out[P_SIGMA_CROSS] = v * net.sigma_cross[j] + u * net.sigma_cross[j + 1]
-    out[P_SIGMA_BEND] = net.sigma_bend[j]
     out[P_GRADIENT_RATE] = (knots[j + 1, GRADIENT] - knots[j, GRADIENT]) / h if over == 0.0 else 0.0
     out[P_CANT_RATE] = (knots[j + 1, CANT] - knots[j, CANT]) / h if over == 0.0 else 0.0
 

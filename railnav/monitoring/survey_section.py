@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -58,8 +57,6 @@ def measured_section(
         part = passage if passage.section is section else onto(passage, section)
         if part is not None:
             recordings.append(record(run, part, against_model=True))
-    there = {recording.run.id for recording in recordings}
-    notes = tuple(f"run {run.id}: does not touch section {section.name}" for run in runs if run.id not in there)
     if not recordings:
         ways = sorted({passage.section.name for _, passage in found})
         raise OffModelError(
@@ -67,5 +64,4 @@ def measured_section(
         )
     knots = np.concatenate([np.arange(model.knot_start[i], model.knot_start[i + 1]) for i in section.track])
     surveyed = bool(np.isfinite(model.covariance_g[knots]).any())
-    axis = measured_axis(section, recordings)
-    return replace(axis, notes=notes + axis.notes), surveyed
+    return measured_axis(section, recordings), surveyed

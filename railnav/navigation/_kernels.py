@@ -16,12 +16,14 @@ from railnav import units
 from railnav.matching import _kernels as paths
 from railnav.matching._kernels import (
     BELIEVED,
+    BY_COURSE,
     BY_ODOMETER,
     BY_PATH,
     BY_POSITION,
     COUNT,
     CURRENT,
     FADING,
+    FRAMED,
     MOVED,
     P_CURVATURE,
     P_D_EAST,
@@ -33,7 +35,6 @@ from railnav.matching._kernels import (
     POINT_SIZE,
     RECORD,
     VERSION,
-    clone,
     credit,
     drop,
     drop_all,
@@ -111,7 +112,6 @@ from railnav.navigation.columns import (
     K_LOST_AFTER,
     K_LOST_SIGMA,
     K_MAP_LENGTH,
-    K_MEMORY,
     K_MERGE,
     K_MODEL,
     K_MOST,
@@ -143,6 +143,7 @@ from railnav.navigation.columns import (
     RING,
     RIVAL_INTERVAL,
     ROW_GATE,
+    S_COURSE,
     S_NIS,
     S_PULL,
     S_SAID,
@@ -185,15 +186,12 @@ from railnav.navigation.dynamics._kernels import (
     project,
     reweigh_frame,
     robust_row,
-    stamps,
-    take_back,
-    timed,
     transition,
     variance_of,
     widen,
 )
 from railnav.navigation.integrity import _kernels as integrity
-from railnav.navigation.integrity._kernels import keep_check
+from railnav.navigation.integrity._kernels import keep_check, stray, weigh_positions
 from railnav.navigation.measurements import _kernels as measurements
 from railnav.navigation.measurements._kernels import (
     balise_place,
@@ -210,6 +208,24 @@ from railnav.navigation.standing._kernels import depart, heaviest, hold_repeated
 
 
 @part
+def nearest_to_fix(fil, shared, bank):
+    """Slot of the hypothesis that needs the least GNSS error."""
+    i_g = fil.at[GNSS_EAST]
+    scale = shared.common[C_SCALE] * fil.settings[K_CORRELATED]
+    best = bank.live[1]
+    least = np.inf
+    for i in range(bank.live[0]):
+        x = bank.x[bank.live[1 + i]]
+        east = x[0] + scale * shared.common[C_SIGMA_EAST] * x[i_g]
+        north = x[1] + scale * shared.common[C_SIGMA_NORTH] * x[i_g + 1]
+        size = east * east + north * north
+        if size < least:
+            least = size
+            best = bank.live[1 + i]
+    return best
+
+
+@part
 def adapt(fil, shared, bank, work, time, dt):
     """Learn the scale of the receiver's sigmas, and let the constant part's prior follow what is seen of it, exactly."""
     k = fil.settings
@@ -217,6 +233,8 @@ def adapt(fil, shared, bank, work, time, dt):
     i_g = fil.at[GNSS_EAST]
     square = 0.0
     frame = 0.0
+    base = 0.0
+    gained = 0.0
     for i in range(bank.live[0]):
         h = bank.live[1 + i]
         x, L = bank.x[h], bank.P_sqrt[h]
@@ -243,9 +261,11 @@ def adapt(fil, shared, bank, work, time, dt):
     least = min(max(stated, k[K_FRAME_LEAST]), k[K_FRAME_MOST])
     new = min(max(math.sqrt(0.5 * frame), old / 1.5, least), 1.5 * old, k[K_FRAME_MOST])
     if abs(new / old - 1.0) > 0.2:
+        near = nearest_to_fix(fil, shared, bank)
         for i in range(bank.live[0]):
             h = bank.live[1 + i]
-            change = reweigh_frame(
+            work.mix[0, i] = bank.info[h, FADING]
+            work.mix[1, i] = reweigh_frame(
                 bank.x[h],
                 bank.P_sqrt[h],
                 old,
@@ -255,7 +275,15 @@ def adapt(fil, shared, bank, work, time, dt):
                 work.vector[W_KEEP],
                 work.vector[W_MOVE],
             )
-            bank.info[h, FADING] += change
+            if h == near:
+                base, gained = work.mix[0, i], work.mix[1, i]
+        for i in range(bank.live[0]):
+            change = work.mix[1, i]
+            if (
+                new > old
+            ):  # at most what the narrow prior has cost: a wide one makes no track likelier than one nearer to the fixes
+                change = min(change, gained + max(base - work.mix[0, i], 0.0))
+            bank.info[bank.live[1 + i], FADING] += change
         common[C_FRAME_SIGMA] = new
 
 
@@ -432,6 +460,7 @@ def sense_all(fil, net, shared, bank, work, row, dt):
         h = bank.live[1 + i]
         x = bank.x[h]
         work.slot[h, S_YAW] = np.inf
+        work.slot[h, S_COURSE] = 0.0
         path_point(net, bank, h, x[i_s], work.point[h])
         work.point[h, POINT_SIZE] = x[i_s]
         motion_rows(fil, net, shared, bank, work, h, row, dt, still)
@@ -440,8 +469,24 @@ def sense_all(fil, net, shared, bank, work, row, dt):
             bank.tags[h, MOVED] = 1
             reverse = fil.settings[K_REVERSE]
             credit(bank, h, BY_PATH, math.log(reverse if x[i_v] < 0.0 else 1.0 - reverse))
+    weigh_courses(bank, work)
     if worst < np.inf:
         judge_gyro(fil, shared, bank, work, row[TIME], dt, worst)
+
+
+@part
+def weigh_courses(bank, work):
+    """Evidence of courses counts with that of positions, and not at all if the receiver is astray or the track lies elsewhere."""
+    top = -np.inf
+    for i in range(bank.live[0]):
+        top = max(top, work.slot[bank.live[1 + i], S_COURSE])
+    for i in range(bank.live[0]):
+        h = bank.live[1 + i]
+        said = work.slot[h, S_COURSE] - top
+        bank.info[h, FADING] += said
+        bank.info[h, FRAMED] += said
+        bank.info[h, BY_COURSE] += said  # the fix, let in next, credits both together
+        bank.info[h, BY_POSITION] -= said
 
 
 @part
@@ -480,32 +525,6 @@ def jump(fil, shared, bank, work):
         return 0.0, (along / v) ** 2
     sigma = shared.common[C_SCALE] * k[K_CORRELATED] * shared.common[C_SIGMA_EAST]
     return max((fix[0] ** 2 + fix[1] ** 2) / (sigma * sigma), 1.0), 0.0
-
-
-@part
-def doubt_places(fil, bank, work):
-    """Give every hypothesis a twin that stands where the fix shows it: not the receiver stepped, the place was wrong (17, attribution).
-
-    Later fixes tell: an error that stepped fades, a place does not. The twins stand last among the living.
-    """
-    count = bank.live[0]
-    if 2 * count > bank.used.shape[0]:
-        return
-    for i in range(count):
-        h = bank.live[1 + i]
-        g = clone(bank, h)
-        for j in range(work.slot.shape[1]):
-            work.slot[g, j] = work.slot[h, j]
-        for j in range(work.point.shape[1]):
-            work.point[g, j] = work.point[h, j]
-        fix = work.fix[h]
-        te, tn = work.point[h, P_D_EAST], work.point[h, P_D_NORTH]
-        size = te * te + tn * tn
-        along = (fix[0] * te + fix[1] * tn) / size
-        variance = (fix[4] * te * te + 2.0 * fix[6] * te * tn + fix[5] * tn * tn) / (size * size)
-        bank.x[g, fil.at[POSITION]] += along
-        widen(bank.P_sqrt[g], fil.at[POSITION], math.sqrt(variance), work.vector[W_COLUMN])
-        work.slot[g, S_STRETCH] += along * along + variance
 
 
 @part
@@ -551,10 +570,7 @@ def fix_all(fil, net, shared, bank, work, row):
     most = -np.inf
     i_g = at[GNSS_EAST]
     keep, move, before = work.vector[W_KEEP], work.vector[W_MOVE], work.vector[W_BEFORE]
-    count = bank.live[0]
-    if step > 0.0 and not timed(fil):
-        doubt_places(fil, bank, work)
-    for i in range(count):
+    for i in range(bank.live[0]):
         h = bank.live[1 + i]
         x, P_sqrt = bank.x[h], bank.P_sqrt[h]
         if step > 0.0:
@@ -567,6 +583,7 @@ def fix_all(fil, net, shared, bank, work, row):
         nis, logdet = work.slot[h, S_NIS], work.slot[h, S_SAID]
         if step > 0.0 or tag > 0.0:
             nis, logdet = position_row(fil, net, shared, bank, work, h, row)
+        stray(fil, bank, work, h, max(time - common[C_FIX_TIME], 0.0), held)
         said = -0.5 * (min(nis, held) + logdet)
         work.slot[h, S_SAID] = said
         most = max(most, said)
@@ -574,30 +591,25 @@ def fix_all(fil, net, shared, bank, work, row):
         for j in range(n):
             before[j] = x[j]
         fix, h_north, f_north = work.fix[h], work.rows[h, 1], work.rows[h, 3]
-        told = stamps(fil, x, P_sqrt)
         absorb(x, P_sqrt, work.rows[h, 2], fix[0], fix[2], keep, move)
         innovation = fix[1]
         for j in range(n):
             innovation -= h_north[j] * (x[j] - before[j])
         project(P_sqrt, h_north, f_north)
         absorb(x, P_sqrt, f_north, innovation, fix[3], keep, move)
-        if tag == 0.0 and not timed(fil):
-            take_back(fil, x, P_sqrt, told, work.vector[W_COLUMN])
-    for i in range(count, bank.live[0]):  # a place that is wrong is as probable as a receiver that steps
-        work.slot[bank.live[1 + i], S_SAID] = work.slot[bank.live[1 + i - count], S_SAID]
     # the evidence of positions fades: errors longer than any correlation time must not add up to certainty
     since = time - common[C_FIX_TIME]
-    fade = math.exp(-since / k[K_MEMORY])
     top = -np.inf
     for i in range(bank.live[0]):
         h = bank.live[1 + i]
-        bank.info[h, FADING] = fade * bank.info[h, FADING] + work.slot[h, S_SAID] - most
-        top = max(top, bank.info[h, FADING])
+        slot = work.slot[h]
+        slot[S_SAID] = weigh_positions(fil, bank, slot, h, slot[S_SAID] - most, since)
+        top = max(top, slot[S_SAID])
     # and it is never beyond doubt: now and then model and receiver are both farther off than they say (a contaminated normal law)
     doubt = k[K_POSITION_DOUBT]
     for i in range(bank.live[0]):
         h = bank.live[1 + i]
-        said = bank.info[h, FADING] - top
+        said = work.slot[h, S_SAID] - top
         said = math.log((1.0 - doubt) * math.exp(said) + doubt * math.exp(said / DOUBTED))
         credit(bank, h, BY_POSITION, said - bank.info[h, BELIEVED])
         bank.info[h, BELIEVED] = said

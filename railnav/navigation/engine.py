@@ -17,7 +17,6 @@ from railnav.navigation import columns as c
 from railnav.navigation.epochs import kernel_table
 from railnav.navigation.integrity import normal_quantile
 from railnav.navigation.prior import USUAL, frame_prior, usual_directions
-from railnav.navigation.shape import shape_of
 from railnav.navigation.state import Settings, State, layout
 
 if TYPE_CHECKING:
@@ -33,7 +32,7 @@ _CHECKS = [paths.CHECK + paths.CHECK_TIME, paths.CHECK + paths.CHECK_SIZE + path
 #: Most that a rival can gain or lose by the GNSS error that the train on its track would have, nat.
 RIVAL_CREDIT = 6.0
 #: Prior odds of a place that a balise shows and no hypothesis is near.
-BALISE_PRIOR = 1e-3
+BALISE_PRIOR = 5e-9
 #: A model's error across its tracks beyond this is estimated, m; what is smaller counts towards the constant part.
 MAP_ERROR_LEAST = 0.1
 #: How near to a start a track may begin that the train may be making for, m, and how often such tracks are looked for, s.
@@ -105,16 +104,6 @@ class Engine:
                 gnss_frame_share=0.0 if self.frame.known else self.settings.gnss_frame_share,
             )
         self.network = pack_network(model)
-        shape = shape_of(model, self.network, gravity=self.settings.gravity)
-        self.network.knots[:, paths.CURVATURE] = shape.curvature
-        assumed = np.where(np.isnan(shape.sigma_curvature), self.settings.curvature_sigma, shape.sigma_curvature)
-        self.network = self.network._replace(sigma_bend=assumed)
-        self.settings = replace(
-            self.settings,
-            accelerometer_noise=math.hypot(self.settings.accelerometer_noise, shape.force_noise),
-            curvature_length=self.settings.curvature_length if math.isnan(shape.length) else shape.length,
-            curvature_shift=self.settings.curvature_shift if math.isnan(shape.shift) else shape.shift,
-        )
         self._loose = _loose_ends(model, self.network)
         self._unseen: dict[int, float] = {}
         middle, _, _ = model.frame.to_geodetic(model.easting[[0, -1]].mean(), model.northing[[0, -1]].mean(), None)
@@ -136,9 +125,6 @@ class Engine:
             int(signed_odometer),
             float(np.median(self.network.sigma_cross)),
             int(balises),
-            shape.slope,
-            shape.turned,
-            int(shape.canted),
         )
         self.bank = paths.Bank(
             np.zeros((SLOTS, n)),
@@ -287,6 +273,10 @@ class Engine:
                 bank.tags[h, paths.SIGN] = 1 if v >= 0.0 else -1
                 bank.info[h] = 0.0
                 bank.info[h, [paths.SLIP_SINCE, paths.AGREE_SINCE]] = -np.inf
+                bank.info[h, paths.ASTRAY] = -np.inf
+                bank.info[h, paths.FRAMED] = math.log(settings.frame_fault) if settings.frame_fault > 0.0 else -np.inf
+                bank.info[h, paths.ASTRAY_VARIANCE] = -1.0
+                bank.info[h, paths.FRAMED_VARIANCE] = settings.frame_fault_sigma**2
                 bank.info[h, _CHECKS] = np.inf, -np.inf
                 bank.info[h, paths.BY_PATH] = math.log(prior)
                 bank.info[h, paths.PASSED] = local
@@ -392,7 +382,8 @@ class Engine:
             bank.tags[h, [paths.COUNT, paths.CURRENT]] = 1, 0
             bank.tags[h, [paths.RECORD, paths.VERSION]] = -1
             bank.info[h] = bank.info[best]
-            bank.info[h, [paths.FADING, paths.BELIEVED]] += likelier
+            bank.info[h, [paths.FADING, paths.ASTRAY, paths.FRAMED, paths.BELIEVED]] += likelier
+            bank.info[h, [paths.ASTRAY_VARIANCE, paths.FRAMED_VARIANCE]] = -1.0
             bank.info[h, paths.BY_PATH] += math.log(odds)
             bank.info[h, paths.PASSED] = local
             bank.info[h, _CHECKS] = np.inf, -np.inf
@@ -435,6 +426,7 @@ class Engine:
             bank.tags[h, [paths.RECORD, paths.VERSION]] = -1
             bank.info[h] = bank.info[best]
             bank.info[h, paths.BY_PATH] += math.log(0.5 * BALISE_PRIOR)
+            bank.info[h, [paths.ASTRAY_VARIANCE, paths.FRAMED_VARIANCE]] = -1.0
             bank.info[h, paths.PASSED] = local
             bank.info[h, _CHECKS] = np.inf, -np.inf
 

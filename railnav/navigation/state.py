@@ -153,11 +153,17 @@ class Settings:
     gnss_fault : float
         Probability that the receiver has gone astray within the last two minutes, in a way that its fixes do not show: the protection
         level then rests on the wheel alone since before that. 0: it is not reckoned with.
+    frame_fault, frame_fault_sigma : float
+        Probability that a run's frame is off by far more than is known of it (a wrong datum, an antenna elsewhere, a map moved), and
+        the standard deviation of that, m. With `astray_rate` it limits what positions alone may say of tracks side by side.
+    astray_rate, astray_walk, astray_time : float
+        How often a receiver goes astray, or comes to a stretch where the track lies elsewhere than the model has it, 1/s; how its
+        error across the track then wanders, m/sqrt(s), and how long that lasts on average, s.
     balise_missed : float
         Probability that a balise is passed and not read.
     curvature_sigma, curvature_shift, curvature_length : float
-        Errors of the curvature of a model that states none of its own (see `railnav.navigation.shape`): of its value, 1/m, of the place
-        where it changes, m, and the length over which both are correlated, m.
+        Errors of the model's curvature: of its value, 1/m, of the place where it changes, m, and the length over which both are
+        correlated, m.
     course_doubt : float
         Difference in bearing that does not tell one track from another, rad; a turnout's legs part by 0.05 and more.
     curvature_doubt : float
@@ -249,6 +255,11 @@ class Settings:
     side_scale: float = 0.2
     balise_sigma: float = 0.5
     gnss_fault: float = 1e-3
+    frame_fault: float = 6e-3
+    frame_fault_sigma: float = 10.0
+    astray_rate: float = 1e-3
+    astray_walk: float = 0.6
+    astray_time: float = 20.0
     balise_missed: float = 1e-3
     curvature_sigma: float = 2e-5
     curvature_shift: float = 0.4

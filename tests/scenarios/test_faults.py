@@ -14,9 +14,8 @@ from railnav.simulation.faults import Fault
 
 #: Faults that the navigator does not master yet; `docs/accuracy.md` says so.
 NOT_YET = {
-    "balise-misnamed",
     "gnss-ramp-along-0.1",
-    "gnss-ramp-left-0.5",
+    "gnss-ramp-along-0.5",
     "gnss-sigma-third",
     "gnss-frame-9m-south",
     "odometer-dead",

@@ -50,6 +50,7 @@ from railnav.navigation.columns import (
     K_CONFIDENCE,
     K_GRAVITY,
     LOST,
+    NEGLIGIBLE,
     OFF_MODEL,
     OUT_ACCELERATION,
     OUT_DIRECTION,
@@ -127,10 +128,10 @@ def _heavier(mass, logw, a, b):
 
 
 @part
-def at_a_toe(fil, bank, h):
+def at_a_toe(fil, weight, bank, h):
     """Whether another living hypothesis parts from this one at a turnout that either may not have reached yet (20, the guard).
 
-    Evidence of a turnout's legs counts only when the train is past the toe for certain.
+    Evidence of a turnout's legs counts only when the train is past the toe for certain. One that is all but refuted need not be past it.
     """
     i_s = fil.at[POSITION]
     s_h = bank.x[h, i_s] - GUARD * math.sqrt(variance_of(bank.P_sqrt[h], i_s))
@@ -148,7 +149,7 @@ def at_a_toe(fil, bank, h):
             if shared >= 0:
                 toe = bank.begin[h, i + 1]
                 s_g = bank.x[g, i_s] - GUARD * math.sqrt(variance_of(bank.P_sqrt[g], i_s))
-                if min(s_h, s_g) < toe:
+                if s_h < toe or (s_g < toe and weight[g] > NEGLIGIBLE):
                     return True
                 break
     return False
@@ -232,7 +233,7 @@ def put_out(fil, net, shared, bank, work, row, out):
     if at[WHEEL_DISTANCE] >= 0:
         out[OUT_LEVEL] = max(out[OUT_LEVEL], separation_bound(fil, bank, h, row[TIME]))
     out[OUT_DIRECTION] = way if forward >= DIRECTION_CONFIDENCE * standing else 0.0
-    if probability < k[K_CONFIDENCE] or at_a_toe(fil, bank, h):
+    if probability < k[K_CONFIDENCE] or at_a_toe(fil, shared.weight, bank, h):
         out[OUT_MODE] = AMBIGUOUS
     elif row[TIME] - common[C_FIX_TIME] > k[K_COASTING]:
         out[OUT_MODE] = COASTING

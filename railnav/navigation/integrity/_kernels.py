@@ -8,6 +8,9 @@ import numpy as np
 from numba import njit
 
 from railnav.matching._kernels import (
+    ASTRAY,
+    ASTRAY_CROSS,
+    ASTRAY_VARIANCE,
     CHECK,
     CHECK_PLACE,
     CHECK_SCALE,
@@ -16,14 +19,30 @@ from railnav.matching._kernels import (
     CHECK_TIME,
     CHECK_VARIANCE,
     CHECK_WHEEL,
+    FADING,
+    FRAMED,
+    FRAMED_CROSS,
+    FRAMED_VARIANCE,
+    P_D_EAST,
+    P_D_NORTH,
     SIGN,
     part,
 )
 from railnav.navigation.columns import (
     CHECK_INTERVAL,
+    FRAME_EAST,
+    FRAME_NORTH,
+    GNSS_EAST,
+    K_ASTRAY_RATE,
+    K_ASTRAY_TIME,
+    K_ASTRAY_WALK,
+    K_GNSS_TIME,
+    K_MEMORY,
     K_ODOMETER_SLIP,
     ODOMETER_SCALE,
     POSITION,
+    S_ASTRAY,
+    S_FRAMED,
     WHEEL_DISTANCE,
 )
 from railnav.navigation.dynamics._kernels import variance_of
@@ -49,6 +68,87 @@ def keep_check(fil, bank, h, time, slipping):
     info[newer + CHECK_SCALE] = bank.x[h, i_k]
     info[newer + CHECK_VARIANCE] = variance_of(bank.P_sqrt[h], i_s)
     info[newer + CHECK_SCALE_VARIANCE] = variance_of(bank.P_sqrt[h], i_k)
+
+
+@part
+def wander(info, error, variance, off, white, walk, held):
+    """Let a fix into an error across the track that may be anything and wanders by `walk` (variance); gives -2 ln p of the fix."""
+    # info (INFO,): its error and variance at the indices `error` and `variance`; a negative variance: not known yet
+    if info[variance] < 0.0:
+        info[error] = off
+        info[variance] = white
+        return np.nan
+    spread = info[variance] + walk
+    total = spread + white
+    off -= info[error]
+    info[error] += spread / total * off
+    info[variance] = spread * white / total
+    return min(off * off / total, held) + math.log(total)
+
+
+@part
+def stray(fil, bank, work, h, since, held):
+    """How much likelier a fix is across the track if the receiver has gone astray, and if the run's frame is off, ln, into its slot.
+
+    The error is then anything: it wanders, fast for a receiver astray, and for a frame no faster than the correlated part does. Call
+    it before the fix is let in: `work` holds the innovation and its covariance. All laws saturate alike.
+    """
+    k = fil.settings
+    info = bank.info[h]
+    slot = work.slot[h]
+    x, fix = bank.x[h], work.fix[h]
+    te, tn = work.point[h, P_D_EAST], work.point[h, P_D_NORTH]
+    size = math.hypot(te, tn)
+    te, tn = te / size, tn / size
+    i_g = fil.at[GNSS_EAST]
+    scale = work.rows[h, 0, i_g]
+    east = scale * x[i_g] + x[fil.at[FRAME_EAST]]
+    north = work.rows[h, 1, i_g + 1] * x[i_g + 1] + x[fil.at[FRAME_NORTH]]
+    innovation = fix[0] * tn - fix[1] * te
+    error = innovation + east * tn - north * te
+    usual = fix[4] * tn * tn - 2.0 * fix[6] * te * tn + fix[5] * te * te
+    white = fix[2] * tn * tn + fix[3] * te * te
+    sound = min(innovation * innovation / usual, held) + math.log(usual)
+    astray = wander(info, ASTRAY_CROSS, ASTRAY_VARIANCE, error, white, k[K_ASTRAY_WALK] ** 2 * since, held)
+    framed = wander(
+        info, FRAMED_CROSS, FRAMED_VARIANCE, error, white, 2.0 * scale * scale / k[K_GNSS_TIME] * since, held
+    )
+    slot[S_ASTRAY] = 0.5 * (sound - astray) if astray == astray else 0.0
+    slot[S_FRAMED] = 0.5 * (sound - framed) if framed == framed else 0.0
+
+
+@part
+def log_sum(a, b):
+    """ln(exp(a) + exp(b))."""
+    top = max(a, b)
+    if top == -np.inf:
+        return top
+    return top + math.log(math.exp(a - top) + math.exp(b - top))
+
+
+@part
+def weigh_positions(fil, bank, slot, h, said, since):
+    """Evidence of positions for a hypothesis, whether the receiver is sound, astray, or its frame off: the first two come and go.
+
+    Forward recursion on ln p(fixes, sound), ln p(fixes, astray) and ln p(fixes, framed); what is older fades. If the receiver is
+    astray or its frame is off, its error may be the one that each of several tracks side by side needs, so that positions alone
+    never tell one from the other beyond the odds of such a fault.
+    """
+    k = fil.settings
+    info = bank.info[h]
+    fade = math.exp(-since / k[K_MEMORY])
+    sound, astray = fade * info[FADING], fade * info[ASTRAY]
+    begins = k[K_ASTRAY_RATE] * since
+    ends = since / k[K_ASTRAY_TIME]
+    if begins > 0.0 and since > 0.0:
+        begins, ends = min(begins, 0.5), min(ends, 0.5)
+        info[FADING] = log_sum(sound + math.log(1.0 - begins), astray + math.log(ends)) + said
+        info[ASTRAY] = log_sum(astray + math.log(1.0 - ends), sound + math.log(begins)) + said + slot[S_ASTRAY]
+    else:
+        info[FADING] = sound + said
+        info[ASTRAY] = astray + said + slot[S_ASTRAY]
+    info[FRAMED] = fade * info[FRAMED] + said + slot[S_FRAMED]
+    return log_sum(log_sum(info[FADING], info[ASTRAY]), info[FRAMED])
 
 
 @part
