@@ -4,7 +4,7 @@
 
 Each train runs on a model built without its own runs. Gaps of 10 and 30 s are cut every two minutes. The position at the end of a gap,
 before the first fix after it, is compared with the smoothed solution of the uncut run: no truth, but metres better than what a gap leaves.
-Baseline: the last fix, carried on at its speed along the nearest track.
+Baseline: the last fix before the gap, carried on along the track at the speed that the receiver gave with it.
 """
 
 from __future__ import annotations
@@ -71,8 +71,20 @@ def one(model: rn.TrackModel, run: Run, gap: float) -> tuple[list[float], list[f
         k = int(np.searchsorted(found.time, begin + 1e-6)) - 1
         changes += int(len(set(found.track[k : i + 1].tolist())) > 1)
         a = int(np.argmin(np.abs(reference.time - begin)))
-        naive.append(reference.speed[a] * (found.time[i] - begin) - _run_between(reference, a, j))
+        naive.append(_carried_on(model, run, begin, found.time[i], reference, a) - _run_between(reference, a, j))
     return errors, sigmas, naive, inside, changes
+
+
+def _carried_on(model: rn.TrackModel, run: Run, begin: float, end: float, reference: rn.Solution, a: int) -> float:
+    """Way from the reference's place at the last fix to where its position and speed, both as received, lead until the gap's end, m."""
+    gnss = run.gnss
+    assert gnss is not None
+    k = int(np.argmin(np.abs(gnss.time - begin)))
+    east, north, *_ = model.frame.to_grid(gnss.latitude[k], gnss.longitude[k], 0.0)
+    ahead = np.sin(reference.heading[a]), np.cos(reference.heading[a])
+    offset = (east - reference.easting[a]) * ahead[0] + (north - reference.northing[a]) * ahead[1]
+    speed = gnss.speed[k] if gnss.speed is not None and np.isfinite(gnss.speed[k]) else reference.speed[a]
+    return float(offset + speed * (end - begin))
 
 
 def _run_between(solution: rn.Solution, a: int, b: int) -> float:

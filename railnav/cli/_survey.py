@@ -42,16 +42,30 @@ def print_update(entry: dict[str, Any], title: str) -> None:
     )  # fmt: skip
     print_table(
         "Tracks",
-        ("track", "length", "sigma before", "sigma now", "axis changed, RMS", "most", "moved stretches"),
+        ("track", "length", "new", "sigma before", "sigma now", "axis changed, RMS", "most", "moved stretches"),
         [
             (
-                t["track"], words.length(t["length_m"], 5), _mm(t["sigma_before_m"]), _mm(t["sigma_m"]), _mm(t["change_rms_m"]),
-                _mm(t["change_max_m"]), sum(c["verdict"] == "moved" for c in t["changes"]),
+                t["track"], words.length(t["length_m"], 5), _new(t), _mm(t["sigma_before_m"]), _mm(t["sigma_m"]),
+                _mm(t["change_rms_m"]), _mm(t["change_max_m"]), sum(c["verdict"] == "moved" for c in t["changes"]),
             )
             for t in entry["tracks"]
         ],
     )  # fmt: skip
+    print_table(
+        "Beyond the model",
+        ("run", "where", "length", "fixes", "became"),
+        [
+            (way["run"], way["where"], words.length(way["length_m"], 4), way["fixes"], way["became"] or "nothing yet")
+            for way in entry["beyond"]
+        ],
+        left=2,
+    )
     print_warnings(entry["warnings"])
+
+
+def _new(track: dict[str, Any]) -> str:
+    """How much of a track is new."""
+    return words.length(track["new_m"], 4) if track["new_m"] else ""
 
 
 def print_difference(found: Difference, title: str) -> None:

@@ -22,6 +22,7 @@ TABLE_ENDINGS = (".csv", ".parquet")
 @click.option(
     "--design", type=PATH, help="Design to reach: LandXML (.xml) or elements (.csv).  [default: a smoothed target]"
 )
+@click.option("--alignment", metavar="NAME", help="The design meant, where its file holds several along the section.")
 @click.option("--design-crs", help="Plane of the design, where its file does not say.  [default: the model's]")
 @click.option("--report", type=PATH, help="Also write a page about the plan, .html.")
 @click.option("--axis", type=PATH, help="Also write the lined axis as a model: .gpkg, .geojson, .xml (LandXML), ...")
@@ -59,12 +60,20 @@ TABLE_ENDINGS = (".csv", ".parquet")
     show_default=True,
     help="Greatest change of curvature that what is left may add, in plan and profile, 1/m^2.",
 )
+@click.option(
+    "--ramp",
+    type=click.FloatRange(0, 100, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="How fast corrections may begin and fade out at the ends, mm a metre.",
+)
 @json_option
 def command(
     runs: tuple[Path, ...],
     model: Path,
     output: Path,
     design: Path | None,
+    alignment: str | None,
     design_crs: str | None,
     report: Path | None,
     axis: Path | None,
@@ -76,13 +85,15 @@ def command(
     least_lift: float,
     most_lift: float,
     curvature_rate: float,
+    ramp: float,
     as_json: bool,
 ) -> None:
     """Plan slews and lifts from the measured track to its design or a smoothed target.
 
     The track is measured by the RUNs' positions and angles where they are good enough, otherwise the model's own axis is taken; the plan
     says which, and how good it is. Slews are to the right as the distance grows. Fixed points, the greatest slew, lifts that only lift
-    and the change of curvature are kept exactly (linear programme); the classic versine method stands beside it.
+    and the change of curvature are kept exactly (linear programme), and the work fades out at its ends; the classic versine method stands
+    beside it. Of a design file the alignment along the section is taken.
 
     \b
     Example:
@@ -105,6 +116,8 @@ def command(
         _files.check_output(axis, _files.EXPORT_ENDINGS, inputs=[*inputs, output, *([report] if report else [])])
     if least_lift > most_lift:
         raise click.UsageError(f"--least-lift {least_lift:g} is above --most-lift {most_lift:g}")
+    if design is None and (alignment is not None or design_crs is not None):
+        raise click.UsageError("--alignment and --design-crs go with --design")
     from railnav.io.lining import read_fixed_points, write_plan
     from railnav.io.run import read_run
     from railnav.monitoring.lining import LiningLimits, line_up
@@ -119,15 +132,19 @@ def command(
         if not designs:
             raise InputError("holds no alignment", file=design)
     names = [name.strip() for name in tracks.split(",") if name.strip()] if tracks is not None else []
-    limits = LiningLimits(most_slew / 1e3, least_lift / 1e3, most_lift / 1e3, curvature_rate, curvature_rate)
+    limits = LiningLimits(
+        most_slew / 1e3, least_lift / 1e3, most_lift / 1e3, curvature_rate, curvature_rate, ramp / 1e3
+    )
     with progress() as tell:
-        measured, surveyed = measured_section([read_run(run) for run in runs], reference, tracks=names, progress=tell)
+        recorded = [read_run(run) for run in runs]
+        measured, surveyed = measured_section(recorded, reference, tracks=names, progress=tell)
         slews, lifts = read_fixed_points(fixed, measured.section) if fixed is not None else ((), ())
         if tell:
             tell("line", 0, 1)
         plan = line_up(
             measured,
             designs=designs,
+            alignment=alignment or "",
             step=step,
             cutoff=cutoff,
             limits=limits,
@@ -141,7 +158,7 @@ def command(
     if report is not None:
         from railnav.web.lining import lining_page
 
-        page = lining_page(plan)
+        page = lining_page(plan, simulated=any(run.gnss and run.gnss.receiver == "simulated" for run in recorded))
     write_plan(plan, output)
     if axis is not None:
         from railnav.monitoring.lined import lined_model
@@ -159,6 +176,8 @@ def command(
 
 def facts(plan: LiningPlan) -> dict[str, Any]:
     """The plan as plain facts."""
+    from math import isfinite
+
     return {
         "section": plan.section.name,
         "length_m": float(plan.distance[-1] - plan.distance[0]),
@@ -172,7 +191,16 @@ def facts(plan: LiningPlan) -> dict[str, Any]:
         "greatest_slew_mm": 1e3 * float(abs(plan.slew).max()),
         "mean_slew_mm": 1e3 * float(abs(plan.slew).mean()),
         "greatest_lift_mm": 1e3 * float(plan.lift.max()),
+        "sigma_slew_mm": 1e3 * float(max(plan.sigma_slew)),
         "spread_mm": {f"{name} {band}": [1e3 * a, 1e3 * b] for (name, band), (a, b) in plan.spread.items()},
+        "bears": {
+            f"{name} {band}": {"sigma_mm": 1e3 * sigma if isfinite(sigma) else None, "borne": good}
+            for (name, band), (sigma, good) in plan.bears.items()
+        },
+        "versine_method": {
+            "greatest_slew_mm": 1e3 * float(abs(plan.hallade_slew).max()) if len(plan.hallade_slew) else None,
+            "spread_mm": {f"{name} {band}": [1e3 * a, 1e3 * b] for (name, band), (a, b) in plan.hallade_spread.items()},
+        },
         "notes": list(plan.notes),
     }
 
@@ -194,8 +222,18 @@ def _print(plan: LiningPlan) -> None:
             "greatest lift": words.length(float(plan.lift.max()), 3),
         },
     )
+    strings = plan.hallade_spread
     rows = [
-        [name.replace("_", " "), band, f"{1e3 * before:.2f} mm", f"{1e3 * after:.2f} mm"]
+        [
+            name.replace("_", " "),
+            band,
+            f"{1e3 * before:.2f} mm",
+            f"{1e3 * after:.2f} mm",
+            f"{1e3 * strings[name, band][1]:.2f} mm" if (name, band) in strings else "",
+            "yes" if plan.bears[name, band][1] else "no",
+        ]
         for (name, band), (before, after) in plan.spread.items()
     ]
-    print_table("Standard deviation", ("channel", "band", "before", "after"), rows, left=2)
+    print_table(
+        "Standard deviation", ("channel", "band", "before", "after", "by versines", "axis bears it"), rows, left=2
+    )

@@ -13,8 +13,17 @@ if TYPE_CHECKING:
     from railnav.monitoring.limits import Exceedance
     from railnav.monitoring.monitor import Report
     from railnav.monitoring.quality import Segment
+    from railnav.monitoring.versines import Chord
 
 TABLE_ENDINGS = (".csv", ".parquet")
+#: Standard deviations shown in the terminal.
+SUMMARY = (
+    "combined",
+    "longitudinal_level_left_d1",
+    "longitudinal_level_right_d1",
+    "longitudinal_level_d1",
+    "alignment_d1",
+)
 #: Exceedances shown in the terminal.
 SHOWN = 20
 
@@ -67,6 +76,13 @@ def _default_limits(ctx: click.Context, _: click.Parameter, value: bool) -> None
     help="Twist base, m; may be given more than once.",
 )
 @click.option(
+    "--chord",
+    "chords",
+    metavar="LENGTH | A+B",
+    multiple=True,
+    help="Versines of alignment on this chord, m: 20 about its middle, or 4.1+17.4 behind and ahead; may be given more than once.",
+)
+@click.option(
     "--step", type=click.FloatRange(0.05, 1.0), default=0.25, show_default=True, help="Distance between values, m."
 )
 @click.option(
@@ -92,6 +108,7 @@ def command(
     speed: float | None,
     gauge: float | None,
     bases: tuple[float, ...],
+    chords: tuple[str, ...],
     step: float,
     against: str,
     calibration: Path | None,
@@ -140,6 +157,7 @@ def command(
             step=step,
             gauge=gauge / 1e3 if gauge else None,
             bases=bases,
+            chords=[_chord(text) for text in chords],
             against_model={"auto": None, "model": True, "nothing": False}[against],
             progress=tell,
         )
@@ -154,7 +172,7 @@ def command(
     if list_file is not None:
         from railnav.io.geometry import write_exceedances
 
-        write_exceedances(found, list_file)
+        write_exceedances(found, list_file, model=report.model)
     if quality is not None:
         from railnav.io.geometry import write_quality
 
@@ -174,6 +192,21 @@ def command(
         return
     print_warnings(report.notes)
     _print(report, found, written)
+
+
+def _chord(text: str) -> Chord:
+    from railnav.monitoring.versines import Chord
+
+    arms = text.split("+")
+    try:
+        metres = [float(arm) for arm in arms]
+    except ValueError:
+        metres = []
+    if len(metres) == 1:
+        metres = [0.5 * metres[0]] * 2
+    if len(metres) != 2 or not all(0.1 <= arm <= 200.0 for arm in metres):
+        raise click.BadParameter(f"{text!r} is no chord; give its length, or A+B in metres", param_hint="--chord")
+    return Chord(*metres)
 
 
 def facts(report: Report) -> dict[str, Any]:
@@ -252,12 +285,14 @@ def _quality(graded: tuple[Segment, ...]) -> dict[str, dict[str, Any]]:
 
 
 def _print(report: Report, found: list[Exceedance], written: list[Path]) -> None:
+    from numpy import isfinite
+
     from railnav.cli._terminal import print_table
     from railnav.web import words
     from railnav.web.geometry import LEVEL_WORDS
-    from railnav.web.geometry import SHOWN as UNITS
+    from railnav.web.geometry_tables import SHOWN as UNITS
 
-    rows = []
+    rows: list[list[Any]] = []
     for part in report.sections:
         for g, verdicts in zip(part.geometries, part.verdicts, strict=True):
             judged = [v.title for v in verdicts if not v.reason]
@@ -276,6 +311,30 @@ def _print(report: Report, found: list[Exceedance], written: list[Path]) -> None
     print_table(
         "Sections", ("section", "run", "covers", "channels", "judged", "beyond limits", "immediate"), rows, left=2
     )
+    graded = []
+    for part in report.sections:
+        for g, segments in zip(part.geometries, part.segments, strict=True):
+            for key, found_here in _quality(segments).items():
+                if key in SUMMARY:
+                    classes = ", ".join(f"{letter} {count}" for letter, count in found_here["classes"].items())
+                    sizes = [f"{found_here[name]:.2f} mm" for name in ("median", "largest")]
+                    graded.append([part.section.name, g.recording.run.id, key.replace("_", " "), *sizes, classes])
+    print_table(
+        "Standard deviation over 200 m", ("section", "run", "channel", "median", "largest", "classes"), graded, left=3
+    )
+    grown = [
+        [
+            part.section.name,
+            trend.title,
+            int(trend.growth.significant.sum()),
+            int(isfinite(trend.growth.rate).sum()),
+            f"{1e3 * trend.growth.noise:.3f} mm",
+        ]
+        for part in report.sections
+        for trend in part.trends
+        if trend.growth.significant.any()
+    ]
+    print_table("Growth", ("section", "channel", "segments that change", "of", "repeats within"), grown, left=2)
     refused = {key: reason for part in report.sections for g in part.geometries for key, reason in g.refused.items()}
     print_table(
         "Not given", ("channel", "why"), [[key.replace("_", " "), reason] for key, reason in refused.items()], left=2

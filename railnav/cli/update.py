@@ -22,6 +22,11 @@ if TYPE_CHECKING:
     is_flag=True,
     help="The runs are trains in service: each is navigated on the model, any model, and refines it across the track.",
 )
+@click.option(
+    "--extend",
+    is_flag=True,
+    help="Make track of what runs show beyond the model: longer tracks, new ones, and turnouts.  [default: report it]",
+)
 @click.option("--crs", help="Refuse unless the model is in this plane (an EPSG code or WKT).")
 @click.option(
     "--half-life",
@@ -42,6 +47,7 @@ def command(
     runs: tuple[Path, ...],
     output: Path,
     from_service: bool,
+    extend: bool,
     crs: str | None,
     half_life: float | None,
     false_alarm: float,
@@ -51,14 +57,15 @@ def command(
 
     MODEL carries what the runs behind it know. Each new RUN is compared with it first.
     Where the track was moved, the old axis is forgotten; where new runs contradict each other, they are set aside. Runs
-    on another line, and runs that are in the model already, are refused.
+    on another line, and runs that are in the model already, are refused. Where runs leave the model's tracks, that is
+    reported; with --extend it becomes track.
 
     With --from-service any model will do, drawn from a map too, and any run that can be navigated on it: train and map
     errors are estimated together. The result carries no survey records.
 
     \b
     Example:
-      railnav update demo/line.gpkg demo/later -o line2.gpkg
+      railnav update demo/line.gpkg demo/later -o line2.gpkg --extend
       railnav update demo/line.gpkg demo/service -o line3.gpkg --from-service
     """  # noqa: D301
     from railnav.cli import _files
@@ -81,6 +88,8 @@ def command(
     if from_service:
         if half_life is not None:
             raise click.UsageError("--half-life is of stored surveys; it does not go with --from-service")
+        if extend:
+            raise click.UsageError("--extend makes track of surveys; it does not go with --from-service")
         _from_service(model, stored, runs, output, as_json)
         return
     if stored.record_source is None:
@@ -101,6 +110,7 @@ def command(
             crs=f"EPSG:{crs}" if crs and crs.strip().isdigit() else crs,
             half_life=half_life,
             false_alarm=false_alarm,
+            extend=extend,
             progress=tell,
         )
     _files.write_model(refined, output)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from railnav.errors import EstimationError
-from railnav.estimation import _kernels
+from railnav.estimation import _bordered_kernels, _row_kernels
 from railnav.estimation.chain import Chain, as_floats, prior_rows, start_triangle
 
 FloatArray = NDArray[np.float64]
@@ -136,7 +136,7 @@ def solve_bordered_chain(
     records = np.empty((N - 1, n, 2 * n + p + 1))
     nis, dof, growth = np.empty(N), np.empty(N, np.int64), np.empty(N)
     link_nis, link_dof = np.empty(N - 1), np.empty(N - 1, np.int64)
-    broken = _kernels.bordered_forward_kernel(
+    broken = _bordered_kernels.bordered_forward_kernel(
         owned(chain.H), near, owned(chain.z), owned(chain.counts), owned(chain.M), owned(chain.L), link, owned(chain.u),
         owned(chain.coupling_counts), triangle, records, nis, dof, link_nis, link_dof, growth,
     )  # fmt: skip
@@ -161,13 +161,13 @@ def solve_bordered_chain(
             f"epoch {N - 1}: component {i} of the state is not determined by the rows; add observations"
         )
     root = np.zeros((n + p, n + p))
-    _kernels.invert_upper_kernel(triangle, root)
+    _row_kernels.invert_upper_kernel(triangle, root)
     last, joint = root @ triangle[:, n + p], root @ root.T
     state, P, C = np.empty((N, n)), np.empty((N, n, n)), np.empty((N - 1, n, n))
     cross = np.empty((N, n, p))
     state[-1], P[-1], cross[-1] = last[:n], joint[:n, :n], joint[:n, n:]
     theta, T = np.ascontiguousarray(last[n:]), np.ascontiguousarray(joint[n:, n:])
-    empty = _kernels.bordered_backward_kernel(records, state, theta, P, C, cross, T)
+    empty = _bordered_kernels.bordered_backward_kernel(records, state, theta, P, C, cross, T)
     if empty >= 0:
         epoch, i = divmod(empty, n)
         raise EstimationError(

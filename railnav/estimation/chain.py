@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from railnav.errors import EstimationError
-from railnav.estimation import _kernels
+from railnav.estimation import _chain_kernels, _row_kernels
 from railnav.estimation.gross_error import chi_square_limit
 
 FloatArray = NDArray[np.float64]
@@ -26,6 +26,10 @@ BoolArray = NDArray[np.bool_]
 
 #: State sizes whose sweep is compiled with loops of constant length: two to three times faster, a few seconds once.
 SPECIALISED_SIZES = (3, 6, 9)
+
+
+#: Epochs of a page where records are not kept: those of one page stay in the processor's cache.
+PAGE = 2048
 
 
 @dataclass(frozen=True, slots=True, eq=False, init=False)
@@ -176,7 +180,7 @@ class ChainSolution:
     coupling_nis, coupling_dof : (N - 1,) array
         The same for coupling rows beyond those that carry the state on.
     records : (N - 1, n, 2n + 1) array
-        [R_kk R_kn | d_k]: whitened rows that hold all the past knows of x_k given x_(k+1).
+        [R_kk R_kn | d_k]: whitened rows that hold all the past knows of x_k given x_(k+1); (0, n, 2n + 1) if not kept.
     triangle : (n, n + 1) array
         [R | b] of the last epoch.
     """
@@ -267,6 +271,8 @@ class ChainSolution:
             raise EstimationError(
                 "the chain was solved without covariances; solve_chain(..., covariance=True) gives them"
             )
+        if not len(self.records) and i < j:
+            raise EstimationError("the chain was solved without records; solve_chain(..., records=True) keeps them")
         if not 0 <= i <= j < len(self.state):
             raise EstimationError(f"epochs {i} and {j} are not 0 <= i <= j < {len(self.state)}")
         n = self.state.shape[1]
@@ -284,6 +290,7 @@ def solve_chain(
     evidence: bool = False,
     gate: float | None = None,
     allow_breaks: bool = False,
+    records: bool = True,
 ) -> ChainSolution:
     """Estimate all states of a chain: rotations forward, substitution back.
 
@@ -305,6 +312,9 @@ def solve_chain(
         Leave out an epoch's observations if their NIS is less likely than this, e.g. 1e-4 (rail 17); none by default.
     allow_breaks : bool
         Accept a link that couples nothing, as long as each part is determined by its own rows.
+    records : bool
+        Keep `records`. Without them the store is that of the states alone, a sixth, and the sweep is made twice: page by page
+        backwards from triangles kept on the way. Goes with ``covariance=False``.
 
     Returns
     -------
@@ -334,16 +344,26 @@ def solve_chain(
     """
     if chain.lead:
         raise EstimationError("a stretch that continues a chain (lead = 1) is for ChainFilter.sweep")
+    if not records and covariance:
+        raise EstimationError("covariances need the records; solve_chain(..., covariance=False, records=False)")
     N, n = len(chain), chain.n
     triangle = start_triangle(chain.prior, n)
-    sweep = sweep_chain(chain, triangle, store=True, filtered=filtered, gate=gate, evidence=evidence)
+    state = np.empty((N, n))
+    if records:
+        sweep = sweep_chain(chain, triangle, store=True, filtered=filtered, gate=gate, evidence=evidence)
+    else:
+        sweep, starts = _sweep_pages(chain, triangle, filtered=filtered, gate=gate, evidence=evidence)
     if sweep.broken >= 0 and not allow_breaks:
         raise EstimationError(
             f"the link between epochs {sweep.broken} and {sweep.broken + 1} couples nothing; "
             "solve the two parts as chains of their own, or allow_breaks=True"
         )
-    state = np.empty((N, n))
-    empty = _kernels.smooth_chain_kernel(compiled_size(n))(sweep.records, triangle, state)
+    substitute = _chain_kernels.smooth_chain_kernel(compiled_size(n))
+    empty = (
+        substitute(sweep.records, triangle, state)
+        if records
+        else _substitute_pages(chain, starts, triangle, state, gate)
+    )
     if (
         empty >= 0
         or not np.isfinite(state[0]).all()
@@ -356,7 +376,7 @@ def solve_chain(
     P = C = None
     if covariance:
         P, C = np.empty((N, n, n)), np.empty((N - 1, n, n))
-        _kernels.covariance_chain_kernel(compiled_size(n))(sweep.records, triangle, P, C)
+        _chain_kernels.covariance_chain_kernel(compiled_size(n))(sweep.records, triangle, P, C)
     return ChainSolution(
         state=state,
         covariance=P,
@@ -399,20 +419,93 @@ def sweep_chain(
         nis=np.empty(N),
         dof=np.empty(N, np.int64),
         rejected=np.empty(N, np.bool_),
-        coupling_nis=np.empty(links),
-        coupling_dof=np.empty(links, np.int64),
+        coupling_nis=np.empty(0),
+        coupling_dof=np.empty(0, np.int64),
         filtered=np.empty((N if filtered else 0, n)),
         log_evidence=np.empty(N if evidence else 0),
         broken=-1,
     )
-    forward = _kernels.forward_kernel(compiled_size(n))
-    out.broken = forward(
-        chain.H, chain.z, chain.counts, chain.M, chain.L, chain.u, chain.coupling_counts, chain.lead, triangle, limits,
-        out.records, out.nis, out.dof, out.rejected, out.coupling_nis, out.coupling_dof, out.filtered, out.log_evidence,
-    )  # fmt: skip
+    forward = _chain_kernels.forward_kernel(compiled_size(n))
+    start = triangle.copy()
+    # n rows or fewer a link nearly always carry the state on and leave no residuals: no room is taken for these before there are any
+    for room in (0, links) if chain.u.shape[1] <= n and links > n else (links,):
+        triangle[:] = start
+        out.coupling_nis, out.coupling_dof = np.empty(room), np.empty(room, np.int64)
+        out.broken = forward(
+            chain.H, chain.z, chain.counts, chain.M, chain.L, chain.u, chain.coupling_counts, chain.lead, triangle, limits,
+            out.records, out.nis, out.dof, out.rejected, out.coupling_nis, out.coupling_dof, out.filtered, out.log_evidence,
+        )  # fmt: skip
+        if out.broken != -2:
+            break
+    if len(out.coupling_nis) < links:
+        out.coupling_nis = np.broadcast_to(np.zeros(1), links)
+        out.coupling_dof = np.broadcast_to(np.zeros(1, np.int64), links)
     if evidence:
         out.log_evidence -= 0.5 * (out.nis + out.dof * np.log(2 * np.pi))
     return out
+
+
+def stretch(chain: Chain, first: int, end: int) -> Chain:
+    """Epochs `first` to `end` - 1 with the link that leads to them; its counts may be written. Inside this room only."""
+    lead = 1 if first > 0 else 0
+    links = slice(first - lead, end - 1)
+    M, L, u = (a if len(a) == 1 and len(chain) > 2 else a[links] for a in (chain.M, chain.L, chain.u))
+    return Chain(
+        chain.H if len(chain.H) == 1 else chain.H[first:end],
+        chain.z[first:end],
+        M,
+        L,
+        u,
+        counts=chain.counts[first:end].copy(),
+        coupling_counts=chain.coupling_counts[links],
+        lead=lead,
+    )
+
+
+def _sweep_pages(
+    chain: Chain, triangle: FloatArray, *, filtered: bool, gate: float | None, evidence: bool
+) -> tuple[Sweep, FloatArray]:
+    """Sweep page by page without keeping records; also the triangles from which each page started."""
+    N, n, links = len(chain), chain.n, len(chain.coupling_counts)
+    starts = np.empty((-(-N // PAGE), n, n + 1))
+    out = Sweep(
+        records=np.empty((0, n, 2 * n + 1)), nis=np.empty(N), dof=np.empty(N, np.int64), rejected=np.empty(N, np.bool_),
+        coupling_nis=np.zeros(links), coupling_dof=np.zeros(links, np.int64), filtered=np.empty((N if filtered else 0, n)),
+        log_evidence=np.empty(N if evidence else 0), broken=-1,
+    )  # fmt: skip
+    for page, first in enumerate(range(0, N, PAGE)):
+        starts[page] = triangle
+        end = min(first + PAGE, N)
+        part = stretch(chain, first, end)
+        found = sweep_chain(part, triangle, store=False, filtered=filtered, gate=gate, evidence=evidence)
+        here, before = slice(first, end), slice(first - part.lead, end - 1)
+        out.nis[here], out.dof[here], out.rejected[here] = found.nis, found.dof, found.rejected
+        out.coupling_nis[before], out.coupling_dof[before] = found.coupling_nis, found.coupling_dof
+        if filtered:
+            out.filtered[here] = found.filtered
+        if evidence:
+            out.log_evidence[here] = found.log_evidence
+        if found.broken >= 0 and out.broken < 0:
+            out.broken = first - part.lead + found.broken
+    return out, starts
+
+
+def _substitute_pages(chain: Chain, starts: FloatArray, last: FloatArray, state: FloatArray, gate: float | None) -> int:
+    """Make the records of one page after the other again, from the last to the first, and substitute through them."""
+    N, n = len(chain), chain.n
+    substitute = _chain_kernels.smooth_chain_kernel(compiled_size(n))
+    for page in range(len(starts) - 1, -1, -1):
+        first, end = page * PAGE, min((page + 1) * PAGE, N)
+        part = stretch(chain, first, end)
+        records = sweep_chain(part, starts[page], store=True, filtered=False, gate=gate).records
+        here = slice(first - part.lead, end)
+        empty = int(substitute(records, last, state[here]))
+        if empty >= 0:
+            return (first - part.lead) * n + empty
+        last = np.column_stack(
+            [np.eye(n), state[first - part.lead]]
+        )  # what is known of the state that the next page ends with
+    return -1
 
 
 def fixed_lag(solution: ChainSolution, lag: int) -> FloatArray:
@@ -452,6 +545,8 @@ def fixed_lag(solution: ChainSolution, lag: int) -> FloatArray:
     N, n = solution.state.shape
     if not 0 <= lag < N:
         raise EstimationError(f"lag {lag} is not within 0 to {N - 1}, the epochs of the chain")
+    if lag and len(solution.records) < N - 1:
+        raise EstimationError("the chain was solved without records; solve_chain(..., records=True) keeps them")
     out = solution.filtered[lag:].copy()
     good = np.isfinite(out).all(axis=1)
     for back in range(1, lag + 1):
@@ -488,7 +583,7 @@ def start_triangle(prior: tuple[ArrayLike, ArrayLike] | None, n: int) -> FloatAr
     triangle = np.zeros((n, n + 1))
     if prior is not None:
         R0, b0 = np.asarray(prior[0], np.float64), np.asarray(prior[1], np.float64)
-        _kernels.insert_rows_kernel(triangle, np.ascontiguousarray(np.column_stack([R0, b0])), len(R0))
+        _row_kernels.insert_rows_kernel(triangle, np.ascontiguousarray(np.column_stack([R0, b0])), len(R0))
     return triangle
 
 

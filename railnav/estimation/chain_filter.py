@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from railnav.errors import EstimationError
-from railnav.estimation import _kernels
+from railnav.estimation import _chain_kernels
 from railnav.estimation.chain import Chain, Sweep, as_floats, compiled_size, prior_rows, start_triangle, sweep_chain
 
 FloatArray = NDArray[np.float64]
@@ -290,13 +290,13 @@ class ChainFilter:
         n = self.n
         records = np.array(list(self._records)[len(self._records) - lag :]).reshape(lag, n, 2 * n + 1)
         state = np.empty((lag + 1, n))
-        empty = _kernels.smooth_chain_kernel(compiled_size(n))(records, self._triangle, state)
+        empty = _chain_kernels.smooth_chain_kernel(compiled_size(n))(records, self._triangle, state)
         if empty >= 0:
             raise EstimationError(
                 f"epoch {self._epoch - lag}: the state is not determined by the rows so far; wait for a fix"
             )
         P = np.empty((lag + 1, n, n))
-        _kernels.covariance_chain_kernel(compiled_size(n))(records, self._triangle, P, np.empty((0, n, n)))
+        _chain_kernels.covariance_chain_kernel(compiled_size(n))(records, self._triangle, P, np.empty((0, n, n)))
         return FilterEstimate(self._epoch - lag, state[0], P[0])
 
     def _take(

@@ -66,7 +66,7 @@ class ChangeTest:
 
         return max(1.0, float(np.quantile(self.statistic, 0.75) / chi2.ppf(0.75, self.dof)))
 
-    def nodes(self, *, margin: int = 10) -> BoolArray:
+    def nodes(self, *, margin: int = 5) -> BoolArray:
         """Nodes of the stretches that moved, and `margin` nodes beyond each end.
 
         Parameters

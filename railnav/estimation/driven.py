@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from railnav.errors import EstimationError
-from railnav.estimation import _kernels
+from railnav.estimation import _bordered_kernels, _row_kernels
 from railnav.estimation.bordered import owned
 from railnav.estimation.chain import Chain, as_floats, start_triangle
 
@@ -152,7 +152,7 @@ def solve_driven_chain(
     triangle = start_triangle(chain.prior, n)
     records, filtered = np.empty((links, r, r + n + 1)), np.empty((N, n))
     nis, dof, growth = np.empty(N), np.empty(N, np.int64), np.empty(N)
-    _kernels.driven_forward_kernel(
+    _bordered_kernels.driven_forward_kernel(
         owned(chain.H),
         owned(chain.z),
         owned(chain.counts),
@@ -173,10 +173,10 @@ def solve_driven_chain(
             f"component {i} of the last state is not determined by the rows; add observations or a prior"
         )
     root = np.zeros((n, n))
-    _kernels.invert_upper_kernel(triangle, root)
+    _row_kernels.invert_upper_kernel(triangle, root)
     state, P, C, noise = np.empty((N, n)), np.empty((N, n, n)), np.empty((links, n, n)), np.empty((links, r))
     state[-1], P[-1] = root @ triangle[:, n], root @ root.T
-    _kernels.driven_backward_kernel(inverse, known, driving, records, state, noise, P, C)
+    _bordered_kernels.driven_backward_kernel(inverse, known, driving, records, state, noise, P, C)
     return DrivenSolution(
         state=state,
         covariance=P,

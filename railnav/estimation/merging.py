@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from railnav.errors import EstimationError
-from railnav.estimation import _kernels
+from railnav.estimation import _chain_kernels
 from railnav.estimation.chain import Chain, ChainSolution, as_floats, compiled_size, start_triangle, sweep_chain
 from railnav.estimation.square_root import inverse_root
 
@@ -85,7 +85,14 @@ class ChainRecords:
         -------
         ChainRecords
             Its rows.
+
+        Raises
+        ------
+        EstimationError
+            The chain was solved without keeping its records.
         """
+        if len(solution.records) < len(solution.state) - 1:
+            raise EstimationError("the chain was solved without records; solve_chain(..., records=True) keeps them")
         return cls(solution.records, solution.triangle)
 
     @classmethod
@@ -190,14 +197,14 @@ class ChainRecords:
         """
         N, n = len(self), self.n
         state = np.empty((N, n))
-        empty = _kernels.smooth_chain_kernel(compiled_size(n))(self.records, self.triangle, state)
+        empty = _chain_kernels.smooth_chain_kernel(compiled_size(n))(self.records, self.triangle, state)
         if empty >= 0:
             k, i = divmod(empty, n)
             raise EstimationError(f"node {k}: component {i} of the state is not determined by the stored rows")
         P = C = None
         if covariance:
             P, C = np.empty((N, n, n)), np.empty((N - 1, n, n))
-            _kernels.covariance_chain_kernel(compiled_size(n))(self.records, self.triangle, P, C)
+            _chain_kernels.covariance_chain_kernel(compiled_size(n))(self.records, self.triangle, P, C)
         return ChainSolution(
             state=state,
             covariance=P,

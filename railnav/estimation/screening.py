@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from railnav.errors import EstimationError
-from railnav.estimation.chain import Chain, as_floats, start_triangle, sweep_chain
+from railnav.estimation.chain import Chain, as_floats, start_triangle, stretch, sweep_chain
 from railnav.estimation.gross_error import chi_square_limit
 
 FloatArray = NDArray[np.float64]
@@ -150,7 +150,7 @@ def screen_chain(
     k = 0
     while k < N:
         end = min(k + PAGE, N)
-        page, after = _stretch(clean, k, end), triangle.copy()
+        page, after = stretch(clean, k, end), triangle.copy()
         sweep = sweep_chain(page, after, store=False, filtered=False, gate=significance)
         alarm = int(np.argmax(sweep.rejected)) if sweep.rejected.any() else -1
         if not np.isfinite(after).all():
@@ -165,16 +165,16 @@ def screen_chain(
             continue
         nis, dof = float(sweep.nis[alarm]), int(sweep.dof[alarm])
         if alarm > 0:  # up to the epoch before
-            sweep_chain(_stretch(clean, k, k + alarm), triangle, store=False, filtered=False, gate=None)
+            sweep_chain(stretch(clean, k, k + alarm), triangle, store=False, filtered=False, gate=None)
         k += alarm
         tail = min(k + look_ahead + 1, N)
-        without = _stretch(clean, k, tail)
+        without = stretch(clean, k, tail)
         residual = _innovation(without, triangle)
         without.counts[0] = 0
         wrong: Literal["fix", "link"] = "fix"
         odds = np.nan
         if k > 0:
-            inflated = _stretch(clean, k, tail)
+            inflated = stretch(clean, k, tail)
             M_weak, L_weak, u_weak = inflated.M.copy(), inflated.L.copy(), inflated.u.copy()
             M_weak[0, link_rows] *= weak
             L_weak[0, link_rows] *= weak
@@ -201,50 +201,34 @@ def screen_chain(
             clean.L[k - 1, link_rows] *= weak
             clean.u[k - 1, link_rows] *= weak
         verdicts.append(Verdict(k, wrong, nis, dof, chi_square_limit(dof, significance), float(odds), residual))
-        sweep_chain(_stretch(clean, k, k + 1), triangle, store=False, filtered=False, gate=None)
+        sweep_chain(stretch(clean, k, k + 1), triangle, store=False, filtered=False, gate=None)
         k += 1
     return Screening(clean, tuple(verdicts))
 
 
-def _stretch(chain: Chain, first: int, end: int) -> Chain:
-    """Epochs `first` to `end` - 1 with the link that leads to them; its counts may be written."""
-    lead = 1 if first > 0 else 0
-    links = slice(first - lead, end - 1)
-    return Chain(
-        chain.H if len(chain.H) == 1 else chain.H[first:end],
-        chain.z[first:end],
-        chain.M[links],
-        chain.L[links],
-        chain.u[links],
-        counts=chain.counts[first:end].copy(),
-        coupling_counts=chain.coupling_counts[links],
-        lead=lead,
-    )
-
-
-def _evidence(stretch: Chain, triangle: FloatArray) -> float:
+def _evidence(part: Chain, triangle: FloatArray) -> float:
     """Log-evidence of all observations of a stretch."""
-    sweep = sweep_chain(stretch, triangle.copy(), store=False, filtered=False, gate=None, evidence=True)
+    sweep = sweep_chain(part, triangle.copy(), store=False, filtered=False, gate=None, evidence=True)
     return float(sweep.log_evidence.sum())
 
 
-def _innovation(stretch: Chain, triangle: FloatArray) -> FloatArray:
+def _innovation(part: Chain, triangle: FloatArray) -> FloatArray:
     """Measured - predicted of a stretch's first fix, whitened."""
-    n, c = stretch.n, int(stretch.counts[0])
+    n, c = part.n, int(part.counts[0])
     ahead = triangle.copy()
-    if stretch.lead:
+    if part.lead:
         none = np.zeros((0, n))
         link = Chain(
             none,
             np.zeros((1, 0)),
-            stretch.M[:1],
-            stretch.L[:1],
-            stretch.u[:1],
-            coupling_counts=stretch.coupling_counts[:1],
+            part.M[:1],
+            part.L[:1],
+            part.u[:1],
+            coupling_counts=part.coupling_counts[:1],
             lead=1,
         )
         sweep_chain(link, ahead, store=False, filtered=False, gate=None)
     if (np.diagonal(ahead) == 0).any():
         return np.full(c, np.nan)
     x = np.linalg.solve(ahead[:, :n], ahead[:, n])
-    return np.asarray(stretch.z[0, :c] - stretch.H[0, :c] @ x)
+    return np.asarray(part.z[0, :c] - part.H[0, :c] @ x)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railnav.errors import InputError, TrackError
+from railnav.io.elements import plan_columns
 from railnav.io.tables import Column, Table, Words, read_table, write_table
 from railnav.monitoring.design import Design
 from railnav.track.elements import ARC, CLOTHOID, CUBIC, KIND_NAMES, STRAIGHT, VIENNESE, Cant, Gradients, Plan
@@ -25,16 +26,7 @@ TABLE_ENDINGS = (".csv",)
 DESIGN_ENDINGS = (*LANDXML_ENDINGS, *TABLE_ENDINGS)
 
 _ELEMENTS = (
-    Column("track", text=True, remedy="name the track in every row"),
-    Column("sequence"),
-    Column("start_m", low=-1e7, high=1e7),
-    Column("length_m", positive=True, high=1e5),
-    Column("element", text=True, remedy=f"one of {', '.join(KIND_NAMES)}"),
-    Column("radius_start_m", complete=False, infinite=True),
-    Column("radius_end_m", complete=False, infinite=True),
-    Column("easting_m"),
-    Column("northing_m"),
-    Column("grid_bearing_deg", low=-360.0, high=360.0),
+    *plan_columns(", ".join(KIND_NAMES)),
     Column("sway_1_m", required=False, complete=False),
 )
 _PROFILE = (

@@ -55,17 +55,25 @@ _KINDS = {
 }  # fmt: skip
 _KNOWN = "straight, arc, clothoid, bloss, cosine, sine, helmert"
 
+
+def plan_columns(known: str) -> tuple[Column, ...]:
+    """Columns of a table of elements that say where each one lies and how it bends; `known` lists the kinds of elements."""
+    return (
+        Column("track", text=True, remedy="name the track in every row"),
+        Column("sequence"),
+        Column("start_m", low=-1e7, high=1e7),
+        Column("length_m", positive=True, high=1e5),
+        Column("element", text=True, remedy=f"one of {known}"),
+        Column("radius_start_m", complete=False, infinite=True),
+        Column("radius_end_m", complete=False, infinite=True),
+        Column("easting_m"),
+        Column("northing_m"),
+        Column("grid_bearing_deg", low=-360.0, high=360.0),
+    )
+
+
 _COLUMNS = (
-    Column("track", text=True, remedy="name the track in every row"),
-    Column("sequence"),
-    Column("start_m", low=-1e7, high=1e7),
-    Column("length_m", positive=True, high=1e5),
-    Column("element", text=True, remedy=f"one of {_KNOWN}"),
-    Column("radius_start_m", complete=False, infinite=True),
-    Column("radius_end_m", complete=False, infinite=True),
-    Column("easting_m"),
-    Column("northing_m"),
-    Column("grid_bearing_deg", low=-360.0, high=360.0),
+    *plan_columns(_KNOWN),
     Column("height_m", required=False, complete=False, low=-1000.0, high=10_000.0),
     Column("gradient", required=False, complete=False, low=-0.2, high=0.2),
     Column("cant_start_mm", required=False, complete=False, low=-500.0, high=500.0),

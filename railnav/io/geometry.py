@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from railnav.io.addresses import addresses
 from railnav.io.atomic import atomic_path
 from railnav.io.tables import Words, write_table
 from railnav.monitoring.limits import Exceedance
 from railnav.monitoring.monitor import Report
+from railnav.track.model import TrackModel
 
 FloatArray = NDArray[np.float64]
 
@@ -80,7 +82,7 @@ def write_channels(report: Report, path: str | Path) -> int:
     return len(texts["run"])
 
 
-def write_exceedances(found: Sequence[Exceedance], path: str | Path) -> None:
+def write_exceedances(found: Sequence[Exceedance], path: str | Path, *, model: TrackModel | None = None) -> None:
     """Write exceedances, one row a place: channel, level, value, limit, track, offset, chainage, coordinates, status, source, run.
 
     Parameters
@@ -88,6 +90,8 @@ def write_exceedances(found: Sequence[Exceedance], path: str | Path) -> None:
     found : sequence of Exceedance
     path : path
         .csv or .parquet; replaced whole or not at all. Values and limits are millimetres (twist: mm/m).
+    model : TrackModel, optional
+        Adds `address`, as published, where it has line references.
     """
 
     def numbers(name: str, factor: float = 1.0) -> FloatArray:
@@ -102,6 +106,7 @@ def write_exceedances(found: Sequence[Exceedance], path: str | Path) -> None:
         "track": Words.of(e.track for e in found),
         "offset_m": numbers("offset"),
         "chainage_km": numbers("chainage", 1e-3),
+        **({} if model is None else _address(found, model)),
         "easting_m": numbers("easting"),
         "northing_m": numbers("northing"),
         "status": Words.of(e.status for e in found),
@@ -119,6 +124,12 @@ def write_exceedances(found: Sequence[Exceedance], path: str | Path) -> None:
     }
     with atomic_path(path) as draft:
         write_table(draft, table, decimals=decimals)
+
+
+def _address(found: Sequence[Exceedance], model: TrackModel) -> dict[str, Words]:
+    track = np.array([model.track_index(e.track) for e in found], np.int64)
+    where = addresses(model, track, np.array([e.offset for e in found], float))
+    return {} if where is None else {"address": where}
 
 
 def write_quality(report: Report, path: str | Path) -> int:

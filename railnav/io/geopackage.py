@@ -101,7 +101,7 @@ def write_model(model: TrackModel, path: str | Path) -> None:
             _write_knots(container, model)
             add_styles(container, ("tracks", "nodes", "mileposts"))
             if records is not None:
-                _write_records(container, model, records)
+                _write_records(container, records)
     except (TypeError, ValueError) as error:
         raise ModelError(f"the provenance holds more than JSON values ({error})", file=path) from error
 
@@ -337,11 +337,9 @@ def _checksum(blobs: list[bytes]) -> int:
     return checksum
 
 
-def _write_records(container: Container, model: TrackModel, records: ModelRecords) -> None:
+def _write_records(container: Container, records: ModelRecords) -> None:
     def rows() -> Iterator[tuple[Any, ...]]:
-        names = [track for track in model.track_id if track in records.tracks]
-        for fid, track in enumerate(names, 1):
-            t = records.tracks[track]
+        for fid, (track, t) in enumerate(records.tracks.items(), 1):
             up = t.up if t.up is not None and t.height is not None else None
             arrays = [
                 t.easting, t.northing, t.height if up else None, t.across.rows, t.across.lean, t.across.noise,
@@ -379,8 +377,10 @@ def _write_records(container: Container, model: TrackModel, records: ModelRecord
         [
             (1, "receivers", json.dumps(records.receivers, allow_nan=False, ensure_ascii=False)),
             (2, "runs", json.dumps(records.runs, allow_nan=False, ensure_ascii=False)),
+            (3, "joins", json.dumps(records.joins, allow_nan=False, ensure_ascii=False)),
+            (4, "parts", json.dumps(records.parts, allow_nan=False, ensure_ascii=False)),
         ],
-        description="Receivers and runs behind the records: keys and JSON values",
+        description="Receivers and runs behind the records, and where their tracks join: keys and JSON values",
     )
 
 
@@ -623,6 +623,8 @@ def read_records(path: str | Path) -> ModelRecords:
                 up=borders.get("up"),
                 receivers=dict(facts["receivers"]),
                 runs=tuple(facts["runs"]),
+                joins=tuple(dict(join) for join in facts.get("joins", [])),
+                parts={str(name): [str(part) for part in of] for name, of in facts.get("parts", {}).items()},
             )
         except InputError:
             raise

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railnav.errors import InputError, TrackError
+from railnav.io.addresses import addresses
 from railnav.io.atomic import atomic_path
 from railnav.io.tables import Column, Words, read_table, write_table
 from railnav.monitoring.lining import LiningPlan
@@ -94,7 +95,8 @@ def _mm(value: float) -> float:
 def write_plan(plan: LiningPlan, path: str | Path) -> None:
     """Write a lining plan, one row a node.
 
-    Columns: `distance_m, track, offset_m, chainage_km, station_m, easting_m, northing_m, height_m, slew_mm, lift_mm` (to the right as
+    Columns: `distance_m, track, offset_m, chainage_km, address` (published, where the model has line references: kilometres that jump leave
+    `chainage_km` ambiguous), `station_m, easting_m, northing_m, height_m, slew_mm, lift_mm` (to the right as
     the distance grows, and up), `right_before_mm, right_after_mm, up_before_mm, up_after_mm, versine_before_mm, versine_after_mm,
     slew_versine_mm, sigma_slew_mm, sigma_lift_mm`.
 
@@ -105,6 +107,7 @@ def write_plan(plan: LiningPlan, path: str | Path) -> None:
         .csv or .parquet; replaced whole or not at all.
     """
     track, offset = plan.section.locate(plan.distance)
+    where = addresses(plan.section.model, np.asarray(track, np.int64), offset)
     n = len(plan.distance)
     classic = np.full(n, np.nan)
     if len(plan.hallade_distance):
@@ -115,6 +118,7 @@ def write_plan(plan: LiningPlan, path: str | Path) -> None:
         "track": Words(np.asarray(track, np.int64), plan.section.model.track_id),
         "offset_m": offset,
         "chainage_km": plan.section.at(plan.distance).chainage / 1e3,
+        **({} if where is None else {"address": where}),
         "station_m": plan.station,
         "easting_m": plan.easting,
         "northing_m": plan.northing,
@@ -128,8 +132,8 @@ def write_plan(plan: LiningPlan, path: str | Path) -> None:
         "versine_before_mm": 1e3 * plan.versine_before,
         "versine_after_mm": 1e3 * plan.versine_after,
         "slew_versine_mm": 1e3 * classic,
-        "sigma_slew_mm": np.full(n, 1e3 * plan.measured.sigma_right),
-        "sigma_lift_mm": np.full(n, 1e3 * plan.measured.sigma_up),
+        "sigma_slew_mm": 1e3 * plan.sigma_slew,
+        "sigma_lift_mm": 1e3 * plan.sigma_lift,
     }
     decimals = {name: 2 if name.endswith("_mm") else 4 for name in table} | {"chainage_km": 6}
     with atomic_path(path) as draft:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import IO, Any, ClassVar
@@ -50,11 +50,10 @@ class Writer:
 
     def add(self, stamp: IntArray, columns: Mapping[str, FloatArray]) -> None:
         """Write fixes: stamps, ns since 1970 UTC, and columns of `railnav.io.log_reading.COLUMNS`."""
-        table = {name: columns[name].tolist() if name in columns else None for name in COLUMNS}
         self.fixes += len(stamp)
-        self.rows(stamp, table)
+        self.rows(stamp, columns)
 
-    def rows(self, stamp: IntArray, table: Mapping[str, Any]) -> None:
+    def rows(self, stamp: IntArray, columns: Mapping[str, FloatArray]) -> None:
         """Write the rows of one piece."""
         raise NotImplementedError
 
@@ -68,8 +67,14 @@ class Writer:
         self.file.close()
 
 
-def _moments(stamp: IntArray) -> Any:
-    """Calendar moments, to the microsecond."""
+def _each(stamp: IntArray, columns: Mapping[str, FloatArray], unit: int) -> Iterator[tuple[Any, tuple[Any, ...]]]:
+    """Moment, to `unit` ns, and cells of each fix, in the order of `COLUMNS`; None in a column that is not there."""
+    cells = [columns[name].tolist() if name in columns else [None] * len(stamp) for name in COLUMNS]
+    return zip(_moments((stamp + unit // 2) // unit * unit), zip(*cells, strict=True), strict=True)
+
+
+def _moments(stamp: IntArray) -> Iterator[tuple[datetime, int, int]]:
+    """Midnight, second of the day and ns of the second."""
     day = np.int64(-1)
     base = datetime(1970, 1, 1, tzinfo=UTC)
     whole = stamp // gnss_time.SECOND
@@ -94,12 +99,10 @@ class NmeaWriter(Writer):
     Altitudes are the heights above the ellipsoid with a separation of 0: their sum is right, and no geoid is assumed.
     """
 
-    def rows(self, stamp: IntArray, table: Mapping[str, Any]) -> None:
+    def rows(self, stamp: IntArray, columns: Mapping[str, FloatArray]) -> None:
         """Write the rows of one piece."""
         write = self.file.write
-        columns = [table[name] or [None] * len(stamp) for name in COLUMNS]
-        moments = _moments((stamp + 500_000) // 1_000_000 * 1_000_000)
-        for (midnight, second, rest), row in zip(moments, zip(*columns, strict=True), strict=True):
+        for (midnight, second, rest), row in _each(stamp, columns, 1_000_000):
             latitude, longitude, height, east, north, up, speed, course, _, quality, satellites, hdop = row
             clock = f"{second // 3600:02d}{second % 3600 // 60:02d}{second % 60:02d}.{rest // 1_000_000:03d}"
             place = f"{_minutes(latitude, 2)},{'N' if latitude >= 0 else 'S'},{_minutes(longitude, 3)},{'E' if longitude >= 0 else 'W'}"
@@ -136,12 +139,10 @@ class PosWriter(Writer):
         )
         self.file.write("  sdeu(m)  sdun(m) age(s)  ratio\n")
 
-    def rows(self, stamp: IntArray, table: Mapping[str, Any]) -> None:
+    def rows(self, stamp: IntArray, columns: Mapping[str, FloatArray]) -> None:
         """Write the rows of one piece."""
         write = self.file.write
-        columns = [table[name] or [None] * len(stamp) for name in COLUMNS]
-        moments = _moments((stamp + 500_000) // 1_000_000 * 1_000_000)
-        for (midnight, second, rest), row in zip(moments, zip(*columns, strict=True), strict=True):
+        for (midnight, second, rest), row in _each(stamp, columns, 1_000_000):
             latitude, longitude, height, east, north, up, _, _, _, quality, satellites, _ = row
             if not _known(height):
                 self.skip("without a height")
@@ -166,12 +167,10 @@ class GpxWriter(Writer):
         self.file.write('<?xml version="1.0" encoding="UTF-8"?>\n<gpx version="1.1" creator="railnav" ')
         self.file.write('xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>\n')
 
-    def rows(self, stamp: IntArray, table: Mapping[str, Any]) -> None:
+    def rows(self, stamp: IntArray, columns: Mapping[str, FloatArray]) -> None:
         """Write the rows of one piece."""
         write = self.file.write
-        columns = [table[name] or [None] * len(stamp) for name in COLUMNS]
-        moments = _moments((stamp + 500) // 1000 * 1000)
-        for (midnight, second, rest), row in zip(moments, zip(*columns, strict=True), strict=True):
+        for (midnight, second, rest), row in _each(stamp, columns, 1000):
             latitude, longitude, height, _, _, _, _, _, _, quality, satellites, hdop = row
             clock = f"{second // 3600:02d}:{second % 3600 // 60:02d}:{second % 60:02d}"
             part = f".{rest // 1000:06d}".rstrip("0").rstrip(".")
@@ -209,8 +208,8 @@ class CsvWriter(Writer):
         self.start = start
         self.file.write(",".join(["time_s", *COLUMNS]) + "\n")
 
-    def add(self, stamp: IntArray, columns: Mapping[str, FloatArray]) -> None:
-        """Write fixes: stamps, ns since 1970 UTC, and columns of `railnav.io.log_reading.COLUMNS`."""
+    def rows(self, stamp: IntArray, columns: Mapping[str, FloatArray]) -> None:
+        """Write the rows of one piece."""
         import pyarrow as pa
         from pyarrow import csv as arrow_csv
 
@@ -220,7 +219,6 @@ class CsvWriter(Writer):
         table = pa.table({name: pa.array(column, mask=np.isnan(column)) for name, column in values.items()})
         self.file.flush()
         arrow_csv.write_csv(table, self.file.buffer, arrow_csv.WriteOptions(include_header=False))  # type: ignore[attr-defined]
-        self.fixes += len(stamp)
 
 
 def writer_for(path: Path, draft: Path, start: int) -> Writer:

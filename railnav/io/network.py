@@ -6,8 +6,11 @@ import re
 import sqlite3
 from collections.abc import Mapping
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from railnav.errors import InputError
 from railnav.run import Progress
@@ -47,7 +50,8 @@ def read_network(
     Returns
     -------
     TrackModel
-        `provenance["import"]["notes"]` says what was passed over.
+        `provenance["import"]["notes"]` says what was passed over. Tracks that name their line and have posts give it line references
+        (`railnav.track.posts`), so that published addresses can be looked up.
 
     Raises
     ------
@@ -69,6 +73,33 @@ def read_network(
     if (layer or columns) and ending not in LAYER_ENDINGS:
         raise InputError("has no layers", file=path, remedy="layer and columns are for .gpkg, .shp, .fgb, .gdb")
     plane: dict[str, Any] = {"crs": crs, "zone_width": zone_width, "ellipsoid": ellipsoid}
+    return _referenced(_read(path, plane, spacing, layer, columns, progress))
+
+
+def _referenced(model: TrackModel) -> TrackModel:
+    """The model with line references from the posts of tracks that name their line; what has some already keeps them."""
+    from railnav.track.model import MilePosts
+    from railnav.track.posts import references_from_posts, spread_references
+
+    posts = model.mileposts
+    named = np.array([bool(line) for line in model.line], np.bool_)[posts.track]
+    if len(model.references) or not named.any():
+        return model
+    kept = MilePosts(posts.track[named], posts.offset[named], posts.chainage[named])
+    found = references_from_posts(replace(model, mileposts=kept))
+    return replace(model, references=spread_references(model, found)) if len(found) else model
+
+
+def _read(
+    path: Path,
+    plane: dict[str, Any],
+    spacing: float,
+    layer: str | None,
+    columns: Mapping[str, str] | None,
+    progress: Progress | None,
+) -> TrackModel:
+    """Read the file by the reader of its kind."""
+    crs, ending = plane["crs"], path.suffix.lower()
     if ending in (".geojson", ".json"):
         from railnav.io.geojson import read_geojson
 

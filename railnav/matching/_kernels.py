@@ -35,7 +35,8 @@ def source_stamp(*modules: ModuleType) -> int:
 
 #: Columns of a packed knot: one cache line of eight doubles. Tangents are grid metres per metre of offset.
 OFFSET, EAST, NORTH, D_EAST, D_NORTH, CURVATURE, GRADIENT, CANT = range(8)
-#: Columns of an evaluated point of a path: as a knot without its offset, d(gradient)/ds, the model's sigma across the track, m, d(cant)/ds.
+#: Columns of an evaluated point of a path: as a knot without its offset, d(gradient)/ds, the model's sigma across the track, m, d(cant)/ds,
+#: sigma of its curvature, 1/m.
 (
     P_EAST,
     P_NORTH,
@@ -47,8 +48,9 @@ OFFSET, EAST, NORTH, D_EAST, D_NORTH, CURVATURE, GRADIENT, CANT = range(8)
     P_GRADIENT_RATE,
     P_SIGMA_CROSS,
     P_CANT_RATE,
-) = range(10)
-POINT_SIZE = 10
+    P_SIGMA_BEND,
+) = range(11)
+POINT_SIZE = 11
 #: Integer marks of a hypothesis.
 COUNT, CURRENT, RECORD, VERSION, MOVED, SIGN = range(6)
 TAGS = 6
@@ -86,6 +88,7 @@ class Network(NamedTuple):
 
     knots: FloatArray  # (k, 8)
     sigma_cross: FloatArray  # (k,) m, 0 where the model states none
+    sigma_bend: FloatArray  # (k,) of the curvature, 1/m
     knot_start: IntArray  # (t + 1,)
     length: FloatArray  # (t,) m
     move_start: IntArray  # (2 t + 1,) CSR pointer by track end 2 * track + end
@@ -155,6 +158,7 @@ def track_point(net, track, way, local, out):  # m from the entering end -> out 
     out[P_GRADIENT] = sign * (v * knots[j, GRADIENT] + u * knots[j + 1, GRADIENT])
     out[P_CANT] = sign * (v * knots[j, CANT] + u * knots[j + 1, CANT])
     out[P_SIGMA_CROSS] = v * net.sigma_cross[j] + u * net.sigma_cross[j + 1]
+    out[P_SIGMA_BEND] = net.sigma_bend[j]
     out[P_GRADIENT_RATE] = (knots[j + 1, GRADIENT] - knots[j, GRADIENT]) / h if over == 0.0 else 0.0
     out[P_CANT_RATE] = (knots[j + 1, CANT] - knots[j, CANT]) / h if over == 0.0 else 0.0
 

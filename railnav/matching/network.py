@@ -59,6 +59,7 @@ def pack_network(model: TrackModel) -> Network:
     return Network(
         np.ascontiguousarray(knots),
         np.nan_to_num(np.sqrt(np.maximum(across, 0.0))),
+        np.zeros(len(knots)),
         np.ascontiguousarray(model.knot_start, np.int64),
         np.ascontiguousarray(model.lengths, np.float64),
         np.append(0, np.cumsum(counts)).astype(np.int64),

@@ -113,7 +113,9 @@ def twist_gain(wavelength: ArrayLike, base: float) -> FloatArray:
     return np.abs(2.0 * np.sin(np.pi * base / np.asarray(wavelength, float)))
 
 
-def channels_of(recording: Recording, *, bases: Sequence[float] = TWIST_BASES) -> Geometry:
+def channels_of(
+    recording: Recording, *, bases: Sequence[float] = TWIST_BASES, chords: Sequence[Chord] = ()
+) -> Geometry:
     """Work out every channel that a run's streams support, and say why not for the others.
 
     Parameters
@@ -121,6 +123,8 @@ def channels_of(recording: Recording, *, bases: Sequence[float] = TWIST_BASES) -
     recording : Recording
     bases : sequence of float
         Twist bases, m.
+    chords : sequence of Chord
+        Chords to give versines of alignment for.
 
     Returns
     -------
@@ -144,7 +148,7 @@ def channels_of(recording: Recording, *, bases: Sequence[float] = TWIST_BASES) -
         gauge = series["gauge"]
         add("gauge", "Gauge", "m", gauge.values, gauge.noise, gauge)
     else:
-        refused["gauge"] = "the run has no gauge stream"
+        refused["gauge"] = recording.refused.get("gauge", "the run has no gauge stream")
     _cross_level(recording, bases, channels, refused)
     _bands(recording, channels, refused)
     rails, without = rail_channels(recording, channels)
@@ -172,7 +176,45 @@ def channels_of(recording: Recording, *, bases: Sequence[float] = TWIST_BASES) -
     else:
         refused["curvature"] = "the run has neither an IMU nor gyro angles, or samples them more than 25 m apart"
     _gnss(recording, channels, refused)
-    return Geometry(recording, channels, refused)
+    geometry = Geometry(recording, channels, refused)
+    for chord in chords:
+        _versines(geometry, chord)
+    return geometry
+
+
+def chord_key(chord: Chord) -> str:
+    """Key of the channel of versines on a chord: versine_10+10m.
+
+    Examples
+    --------
+    >>> chord_key(Chord(4.1, 17.4))
+    'versine_4.1+17.4m'
+    """
+    return f"versine_{chord.behind:g}+{chord.ahead:g}m"
+
+
+def _versines(geometry: Geometry, chord: Chord) -> None:
+    """Versines of alignment on a chord, or why there are none."""
+    key, step = chord_key(chord), geometry.recording.step
+    parts = [geometry.channels.get(f"alignment_{band}") for band in ("d1", "d2", "d3")]
+    known = [part for part in parts if part is not None]
+    if len(known) < len(parts):
+        geometry.refused[key] = "versines take alignment in D1, D2 and D3: " + next(
+            geometry.refused[f"alignment_{band}"]
+            for band in ("d1", "d2", "d3")
+            if f"alignment_{band}" in geometry.refused
+        )
+        return
+    if any(abs(arm / step - round(arm / step)) > 1e-3 or arm < step for arm in (chord.behind, chord.ahead)):
+        geometry.refused[key] = (
+            f"arms of {chord.behind:g} and {chord.ahead:g} m are no whole numbers of steps of {step:g} m"
+        )
+        return
+    values = versine_channel(geometry, chord)
+    # of each band, the chord shows at most the greatest share of its waves
+    sigma = math.hypot(*(part.sigma * chord.seen(part.band)[1] for part in known if part.band is not None))
+    title = f"Versine of alignment on {chord.behind:g} + {chord.ahead:g} m"
+    geometry.channels[key] = Channel(key, title, "m", values, sigma, known[0].source, None, known[0].spacing)
 
 
 def _cross_level(

@@ -12,21 +12,15 @@ from numpy.typing import NDArray
 from railnav.errors import TrackError
 from railnav.monitoring.design import Design
 from railnav.monitoring.filters import D1, D2, D3_ALIGNMENT, D3_LEVEL, Band, band_pass, low_pass, stretches
-from railnav.monitoring.position import MeasuredAxis
+from railnav.monitoring.limits import FINE_ENOUGH
+from railnav.monitoring.position import MeasuredAxis, band_sigma, shape_sigma
 from railnav.monitoring.section import Section
 from railnav.monitoring.smoothing import Bounds, FixedPoint, InfeasibleError, corrections, whittaker
+from railnav.monitoring.target import SHORTEST, level_above, target_along
 from railnav.monitoring.versines import Chord, closed_versines, hallade, versines_in_plan
 
 FloatArray = NDArray[np.float64]
 
-#: A design farther than this from the measured axis is not this track's, m.
-FARTHEST = 1.0
-#: Heights of a design farther than this from the measured ones have another datum, m.
-FARTHEST_HEIGHT = 1.0
-#: A foot this far ahead of or behind its point lies beyond the design's ends, m.
-BEYOND = 0.05
-#: Shortest stretch that is lined, m.
-SHORTEST = 100.0
 #: A plan on an axis known worse than this is not for a machine, m.
 USABLE = 0.02
 #: A shape known worse than this is said, m.
@@ -49,6 +43,8 @@ class LiningLimits:
         Greatest third derivative of the deviation left in plan, 1/m^2.
     gradient_rate : float
         The same in profile, 1/m^2.
+    ramp : float
+        Greatest correction over the distance from the nearer end, m/m: how fast the work may begin and fade out.
     """
 
     most_slew: float = 0.10
@@ -56,6 +52,7 @@ class LiningLimits:
     most_lift: float = 0.10
     curvature_rate: float = 5e-6
     gradient_rate: float = 5e-6
+    ramp: float = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,8 +78,16 @@ class LiningPlan:
         On a chord of 20 m, m; NaN near the ends.
     hallade_distance, hallade_slew : (k,) array
         The versine method beside it: points and slews, m.
+    hallade_spread : mapping of (str, str) to (float, float)
+        Like `spread`, of alignment, by the versine method's slews.
+    sigma_slew, sigma_lift : (n,) array
+        Standard deviation of each slew and lift by the errors of the measured axis, m: of its place where the target is a design, of its
+        shape where the target is smoothed out of the axis itself. Neighbours share most of it.
     spread : mapping of (str, str) to (float, float)
         Standard deviation before and after by channel ("alignment", "longitudinal_level") and band, m.
+    bears : mapping of (str, str) to (float, bool)
+        By channel and band: sigma that the axis has there by the noise of its sensors, m (NaN where that is not known), and whether it
+        bears corrections in that band: the sigma is at most a third of what was found there.
     measured : MeasuredAxis
     design : str
         The design's track; empty for a smoothed target.
@@ -109,7 +114,11 @@ class LiningPlan:
     versine_after: FloatArray
     hallade_distance: FloatArray
     hallade_slew: FloatArray
+    hallade_spread: Mapping[tuple[str, str], tuple[float, float]]
+    sigma_slew: FloatArray
+    sigma_lift: FloatArray
     spread: Mapping[tuple[str, str], tuple[float, float]]
+    bears: Mapping[tuple[str, str], tuple[float, bool]]
     measured: MeasuredAxis
     design: str
     cutoff: float
@@ -128,6 +137,7 @@ def line_up(
     measured: MeasuredAxis,
     *,
     designs: Sequence[Design] = (),
+    alignment: str = "",
     step: float = 5.0,
     cutoff: float = 100.0,
     limits: LiningLimits | None = None,
@@ -144,7 +154,9 @@ def line_up(
     ----------
     measured : MeasuredAxis
     designs : sequence of Design
-        The one that lies along most of the section is used.
+        The one named, or that bears the name of a track of the section, or lies along most of it, is used.
+    alignment : str
+        Name of the design meant, where several lie along the section.
     step : float
         Between nodes, m: 1 or 5, or another multiple of the measured axis's step.
     cutoff : float
@@ -162,7 +174,8 @@ def line_up(
     Raises
     ------
     TrackError
-        The design misses the axis by more than a metre, or covers less than 100 m of it; the message says where.
+        The design misses the axis by more than a metre, or covers less than 100 m of it; the message says where. Several designs could be
+        meant; the message names them.
     InfeasibleError
         Limits and fixed points contradict each other; the message names them.
 
@@ -185,6 +198,7 @@ def line_up(
     section, d = measured.section, measured.distance[part]
     model = section.at(d)
     right, up = measured.right[part], measured.up[part]
+    rows = np.arange(part.start, part.stop)
     sin, cos = np.sin(model.grid_bearing), np.cos(model.grid_bearing)
     scale = grid_scale(section, d)
     east, north = model.easting + right * scale * cos, model.northing - right * scale * sin
@@ -192,15 +206,19 @@ def line_up(
     station = np.full(len(d), np.nan)
     name = ""
     if designs:
-        design, sense, kept, station, cross = _against(designs, east, north, d, section)
+        target = target_along(designs, east, north, d, section, name=alignment)
+        kept = target.rows
+        notes += target.notes
         if kept.stop - kept.start < len(d):
             notes.append(
                 f"the design covers {d[kept.stop - 1] - d[kept.start]:.0f} m of the {d[-1] - d[0]:.0f} m measured; the rest stays"
             )
-        d, east, north, height, station, up = d[kept], east[kept], north[kept], height[kept], station[kept], up[kept]
-        sin, cos, scale = sin[kept], cos[kept], scale[kept]
-        deviation, name = sense * cross[kept], design.track
-        level = _level_against(design, station, height, notes)
+        d, east, north, height, up = d[kept], east[kept], north[kept], height[kept], up[kept]
+        sin, cos, scale, rows = sin[kept], cos[kept], scale[kept], rows[kept]
+        station, design = target.station[kept], target.design
+        deviation, name = target.sense * target.cross[kept], design.track
+        level, said = level_above(design, station, height)
+        notes += [said] if said else []
         if np.isnan(level).all() and np.isfinite(height).all() and design.profile is None:
             notes.append("the design has no profile: lifts smooth the profile as measured")
             level = up
@@ -219,14 +237,15 @@ def line_up(
     nodes = slice(0, (len(d) - 1) // k * k + 1, k)
     y = _noded(deviation, measured.step, step, nodes)
     s = d[nodes]
-    target = np.zeros(len(y)) if name else whittaker(y, step, cutoff)
-    bounds = Bounds(-limits.most_slew, limits.most_slew, limits.curvature_rate)
-    slew = _corrected(measured, y, target, step, bounds, fixed_slew, float(s[0]))
+    aim = np.zeros(len(y)) if name else whittaker(y, step, cutoff)
+    bounds = Bounds(-limits.most_slew, limits.most_slew, limits.curvature_rate, ramp=limits.ramp)
+    notes += _outside(fixed_slew, "slew", s, step) + _outside(fixed_lift, "lift", s, step)
+    slew = _corrected(measured, y, aim, step, bounds, fixed_slew, float(s[0]))
     lift, z = np.full(len(s), np.nan), np.full(len(s), np.nan)
     if np.isfinite(level).all():
         z = _noded(level, measured.step, step, nodes)
         goal = z if free_level else np.zeros(len(z))
-        rise = Bounds(limits.least_lift, limits.most_lift, limits.gradient_rate)
+        rise = Bounds(limits.least_lift, limits.most_lift, limits.gradient_rate, ramp=limits.ramp)
         lift = _corrected(measured, z, goal, step, rise, fixed_lift, float(s[0]))
     else:
         notes.append("no heights along the whole stretch: no lifts")
@@ -238,6 +257,22 @@ def line_up(
         versines_in_plan(e, n, measured.step, chord) for e, n in ((east, north), (lined_east, lined_north))
     )
     classic = _classic(before, deviation, d, measured.step, cutoff, bool(name))
+    strings = {}
+    if len(classic[0]):
+        inside = (d >= classic[0][0]) & (d <= classic[0][-1])
+        along = _between(classic[0], classic[1], d[inside])
+        strings = _spread(deviation[inside], along, np.empty(0), np.empty(0), measured.step)
+    shape = [
+        shape_sigma(noise, cutoff) if noise else relative
+        for noise, relative in (
+            (measured.noise_right, measured.relative_right),
+            (measured.noise_up, measured.relative_up),
+        )
+    ]
+    bears = _bears(measured, spread)
+    notes += _said(bears)
+    if not (measured.sigma_right <= USABLE):
+        notes.append("not for a machine: the axis is not known well enough for slews of millimetres")
     return LiningPlan(
         section=section,
         distance=s,
@@ -255,7 +290,11 @@ def line_up(
         versine_after=after[nodes],
         hallade_distance=classic[0],
         hallade_slew=classic[1],
+        hallade_spread=strings,
+        sigma_slew=_sigma(measured.sigma_right, shape[0], measured.local_right, rows, bool(name))[nodes],
+        sigma_lift=_sigma(measured.sigma_up, shape[1], measured.local_up, rows, not free_level)[nodes],
         spread=spread,
+        bears=bears,
         measured=measured,
         design=name,
         cutoff=math.nan if name else cutoff,
@@ -264,6 +303,26 @@ def line_up(
         fixed_lift=tuple(fixed_lift),
         notes=tuple(notes),
     )
+
+
+def _outside(fixed: Sequence[FixedPoint], what: str, nodes: FloatArray, step: float) -> list[str]:
+    """Fixed points that the stretch lined does not reach."""
+    first, last = float(nodes[0]) - 0.5 * step, float(nodes[-1]) + 0.5 * step
+    return [
+        f"fixed point {point.name!r} ({what}) at {point.start:.0f} m lies outside the stretch lined, {first:.0f} to {last:.0f} m: not used"
+        for point in fixed
+        if point.finish < first or point.start > last
+    ]
+
+
+def _sigma(place: float, shape: float, local: FloatArray | None, rows: NDArray[np.int64], absolute: bool) -> FloatArray:
+    """Standard deviation of corrections at rows of the axis, m.
+
+    A correction to a design carries the error of the axis's place; one to a line smoothed out of the axis itself only that of its shape,
+    since what both share drops out.
+    """
+    relative = 1.0 if local is None else local[rows] / place
+    return np.asarray((place if absolute or not math.isfinite(shape) else shape) * relative * np.ones(len(rows)))
 
 
 def _corrected(
@@ -282,7 +341,10 @@ def _corrected(
         if measured.sigma_right <= USABLE:
             raise
         known = f"to {measured.sigma_right:.2f} m" if math.isfinite(measured.sigma_right) else "with no stated accuracy"
-        raise InfeasibleError(f"{error}; note that the axis is only known {known}, too coarse for lining") from error
+        raise InfeasibleError(
+            f"{error}; note that the axis is only known {known}, too coarse for lining; slews of a metre, a curvature rate "
+            "of 1e-4 1/m^2 and a cut-off of 500 m show the method on such data"
+        ) from error
 
 
 def _longest(measured: MeasuredAxis, notes: list[str]) -> slice:
@@ -310,56 +372,6 @@ def grid_scale(section: Section, distance: FloatArray) -> FloatArray:
         here = track == i
         out[here] = np.interp(offset[here] + model.offset[knots][0], model.offset[knots], model.scale[knots])
     return out
-
-
-def _against(
-    designs: Sequence[Design], east: FloatArray, north: FloatArray, distance: FloatArray, section: Section
-) -> tuple[Design, float, slice, FloatArray, FloatArray]:
-    """The design along most of the axis, its sense, the rows it covers, their stations and distances to its right."""
-    sample = slice(0, len(east), max(1, len(east) // 400))
-    best: tuple[int, float, Design] | None = None
-    for design in designs:
-        feet = design.project(east[sample], north[sample])
-        over = np.abs(feet.distance - np.abs(feet.cross)) < BEYOND
-        rank = (int((over & (np.abs(feet.cross) < FARTHEST)).sum()), -float(np.median(feet.distance)))
-        if best is None or rank > best[:2]:
-            best = (*rank, design)
-    assert best is not None
-    design = best[2]
-    feet = design.project(east, north)
-    over = np.abs(feet.distance - np.abs(feet.cross)) < BEYOND
-    parts = stretches(over)
-    a, b = max(parts, key=lambda part: part[1] - part[0]) if parts else (0, 0)
-    covered = float(distance[b - 1] - distance[a]) if b > a else 0.0
-    if covered < SHORTEST:
-        raise TrackError(
-            f"design {design.track!r} covers {covered:.0f} m of section {section.name}, too little to line; is it this track's design?"
-        )
-    worst = a + int(np.argmax(np.abs(feet.cross[a:b])))
-    if abs(feet.cross[worst]) > FARTHEST:
-        track, offset = section.locate(distance[worst])
-        raise TrackError(
-            f"design {design.track!r} misses the measured axis by {abs(float(feet.cross[worst])):.2f} m on track "
-            f"{section.model.track_id[int(track)]!r} at {float(offset):.0f} m (station {feet.station[worst]:.0f} m; median "
-            f"{float(np.median(np.abs(feet.cross[a:b]))):.2f} m): not this track's design, or another plane"
-        )
-    sense = 1.0 if feet.station[b - 1] >= feet.station[a] else -1.0
-    return design, sense, slice(a, b), feet.station, feet.cross
-
-
-def _level_against(design: Design, station: FloatArray, height: FloatArray, notes: list[str]) -> FloatArray:
-    """Measured height above the design's profile; NaN where there is none, or its datum is another."""
-    nothing = np.full(len(station), np.nan)
-    if design.profile is None:
-        return nothing
-    level = height - design.at(station).height
-    if not np.isfinite(level).all():
-        return nothing
-    middle = float(np.median(level))
-    if abs(middle) > FARTHEST_HEIGHT:
-        notes.append(f"the design's heights lie {-middle:+.2f} m from the measured ones (another datum?): no lifts")
-        return nothing
-    return level
 
 
 def _noded(values: FloatArray, fine: float, step: float, nodes: slice) -> FloatArray:
@@ -395,6 +407,32 @@ def _spread(
             if step <= band.lower / 3.0 and len(values) * step > 4.0 * band.upper:
                 found[name, band.name] = (_sd(values, step, band), _sd(values + change, step, band))
     return found
+
+
+def _bears(
+    measured: MeasuredAxis, spread: Mapping[tuple[str, str], tuple[float, float]]
+) -> dict[tuple[str, str], tuple[float, bool]]:
+    """Sigma of the axis in each band, and whether it bears corrections there."""
+    found = {}
+    for name, bands, noise in (
+        ("alignment", (D1, D2, D3_ALIGNMENT), measured.noise_right),
+        ("longitudinal_level", (D1, D2, D3_LEVEL), measured.noise_up),
+    ):
+        for band in bands:
+            if (name, band.name) in spread:
+                sigma = band_sigma(noise, band)
+                found[name, band.name] = (sigma, sigma <= FINE_ENOUGH * spread[name, band.name][0])
+    return found
+
+
+def _said(bears: Mapping[tuple[str, str], tuple[float, bool]]) -> list[str]:
+    """Which bands the accuracy of the axis allows, in words, where it does not allow all."""
+    if not bears or all(good for _, good in bears.values()):
+        return []
+    words = {key: f"{key[0].replace('_', ' ')} {key[1]}" for key in bears}
+    allowed = ", ".join(words[key] for key, (_, good) in bears.items() if good) or "none of the bands up to 200 m"
+    wanting = ", ".join(words[key] for key, (_, good) in bears.items() if not good)
+    return [f"the accuracy of the axis allows corrections in {allowed}; in {wanting} they follow noise"]
 
 
 def _sd(values: FloatArray, step: float, band: Band) -> float:

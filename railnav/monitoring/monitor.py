@@ -16,6 +16,7 @@ from railnav.monitoring.quality import Segment, segments
 from railnav.monitoring.recording import record
 from railnav.monitoring.section import Passage, Section, onto, passages_of
 from railnav.monitoring.trends import Trend, trends
+from railnav.monitoring.versines import Chord
 from railnav.navigation import navigate
 from railnav.run import Progress, Run
 from railnav.track.model import TrackModel
@@ -95,6 +96,7 @@ def monitor(
     step: float = 0.25,
     gauge: float | None = None,
     bases: Sequence[float] = TWIST_BASES,
+    chords: Sequence[Chord] = (),
     against_model: bool | None = None,
     progress: Progress | None = None,
 ) -> Report:
@@ -118,6 +120,8 @@ def monitor(
         Nominal gauge, m.
     bases : sequence of float
         Twist bases, m.
+    chords : sequence of Chord
+        Chords to give versines of alignment for.
     against_model : bool, optional
         Whether the model's shape is taken off; by default where it is a design.
     progress : Progress, optional
@@ -154,7 +158,15 @@ def monitor(
             progress("channels", i, len(groups))
         done.append(
             _monitored(
-                where, members, table, speed=speed, step=step, gauge=gauge, bases=bases, against_model=against_model
+                where,
+                members,
+                table,
+                speed=speed,
+                step=step,
+                gauge=gauge,
+                bases=bases,
+                chords=chords,
+                against_model=against_model,
             )
         )
     if progress is not None:
@@ -233,13 +245,15 @@ def _monitored(
     step: float,
     gauge: float | None,
     bases: Sequence[float],
+    chords: Sequence[Chord],
     against_model: bool | None,
 ) -> Monitored:
     members = sorted(members, key=lambda pair: pair[1].extent[0] - pair[1].extent[1])
     geometries: list[Geometry] = []
     overlays: list[Overlay | None] = []
     for run, passage in members:
-        made = channels_of(record(run, passage, step=step, gauge=gauge, against_model=against_model), bases=bases)
+        recorded = record(run, passage, step=step, gauge=gauge, against_model=against_model)
+        made = channels_of(recorded, bases=bases, chords=chords)
         lies: Overlay | None = None
         if geometries:
             # a pass that covers what the reference does not is held against it where both are
@@ -247,9 +261,8 @@ def _monitored(
             if len(lies.shift) and float(np.abs(lies.shift).max()) > LEAST_SHIFT:
                 moved = shifted(passage, lies)
                 if len(moved.time) >= 10:
-                    made = channels_of(
-                        record(run, moved, step=step, gauge=gauge, against_model=against_model), bases=bases
-                    )
+                    recorded = record(run, moved, step=step, gauge=gauge, against_model=against_model)
+                    made = channels_of(recorded, bases=bases, chords=chords)
         geometries.append(made)
         overlays.append(lies)
     if speed is None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from railnav.errors import TrackError
-from railnav.monitoring.filters import band_noise, low_pass, stretches
+from railnav.monitoring.filters import Band, band_noise, gain, low_pass, stretches
 from railnav.monitoring.recording import Recording, Series
 from railnav.monitoring.section import Section
 
@@ -22,6 +22,82 @@ CROSSOVER = 300.0
 SHORTEST_ALONE = 30.0
 #: Runs whose smoothed positions scatter more than this are not used: they would only spoil the model's axis, m.
 COARSEST = 0.03
+
+
+@dataclass(frozen=True, slots=True)
+class AxisNoise:
+    """What one run's noise leaves in the shape of the axis.
+
+    Attributes
+    ----------
+    position, position_spacing : float
+        Sigma of a fix, m, and the distance between fixes, m.
+    angle, angle_spacing : float
+        Sigma of an angle, rad, and the distance between samples, m; 0 without angles.
+    crossover : float
+        Wave at which the one takes over from the other (`CROSSOVER`), m.
+    share : float
+        Weight of the run in the mean.
+    """
+
+    position: float
+    position_spacing: float
+    angle: float
+    angle_spacing: float
+    crossover: float
+    share: float = 1.0
+
+
+def shape_sigma(noise: Sequence[AxisNoise], cutoff: float) -> float:
+    """Standard deviation that runs leave in the waves of an axis that a Whittaker smoother of a cut-off takes out.
+
+    The densities of position and angle noise through the crossover G and past the smoother S,
+
+        sigma^2 = sum share^2 integral |1 - S|^2 [ 2 s_p^2 d_p G^2 + 2 s_a^2 d_a (1 - G)^2 / (2 pi f)^2 ] df.
+
+    Parameters
+    ----------
+    noise : sequence of AxisNoise
+    cutoff : float
+        m.
+
+    Returns
+    -------
+    float
+        m; NaN without runs.
+
+    References
+    ----------
+    docs/theory/geometry.md (16).
+
+    Examples
+    --------
+    >>> angles = AxisNoise(0.02, 30.0, 4e-5, 0.2, 300.0)
+    >>> bool(shape_sigma([angles], 100.0) < 0.2e-3 < 2e-3 < shape_sigma([AxisNoise(0.02, 30.0, 0.0, 0.0, 90.0)], 100.0))
+    True
+    """
+    f = np.geomspace(1.0 / (20.0 * cutoff), 1.0 / 3.0, 2000)
+    return _through(noise, f, 1.0 - 1.0 / (1.0 + (cutoff * f) ** 6))
+
+
+def band_sigma(noise: Sequence[AxisNoise], band: Band) -> float:
+    """Standard deviation that runs leave in an axis within a band, m; NaN without runs: `shape_sigma` with the band's gain for 1 - S."""
+    f = np.geomspace(1.0 / (4.0 * band.upper), 4.0 / band.lower, 2000)
+    return _through(noise, f, gain(1.0 / f, band))
+
+
+def _through(noise: Sequence[AxisNoise], f: FloatArray, passed: FloatArray) -> float:
+    """Sigma of the noise through a filter of given gain at frequencies, 1/m."""
+    if not noise:
+        return math.nan
+    total = 0.0
+    for one in noise:
+        low = 0.5 ** ((one.crossover * f) ** 2)
+        density = 2.0 * one.position**2 * one.position_spacing * low**2
+        if one.angle_spacing > 0.0:
+            density = density + 2.0 * one.angle**2 * one.angle_spacing * ((1.0 - low) / (2.0 * np.pi * f)) ** 2
+        total += one.share**2 * float(np.trapezoid(passed**2 * density, f))
+    return math.sqrt(total)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,6 +121,10 @@ class MeasuredAxis:
         Runs whose measurements shape it.
     notes : tuple of str
         What was used, what not, and why.
+    local_right, local_up : (n,) array or None
+        Standard deviation place by place, where runs or the model's knots differ along the section, m; NaN where nothing was measured.
+    noise_right, noise_up : tuple of AxisNoise
+        Of each run, for `shape_sigma`.
     """
 
     section: Section
@@ -58,6 +138,10 @@ class MeasuredAxis:
     relative_up: float
     runs: tuple[str, ...]
     notes: tuple[str, ...]
+    local_right: FloatArray | None = None
+    local_up: FloatArray | None = None
+    noise_right: tuple[AxisNoise, ...] = ()
+    noise_up: tuple[AxisNoise, ...] = ()
 
 
 def measured_axis(section: Section, recordings: Sequence[Recording], *, step: float = 0.5) -> MeasuredAxis:
@@ -85,8 +169,9 @@ def measured_axis(section: Section, recordings: Sequence[Recording], *, step: fl
     """
     grid = section.grid(step)
     notes: list[str] = []
-    parts: list[tuple[Recording, FloatArray, float, float]] = []
-    rises: list[tuple[FloatArray, float, float]] = []
+    used: list[Recording] = []
+    parts: list[_Part] = []
+    rises: list[_Part] = []
     for recording in recordings:
         if not recording.against_model:
             raise TrackError(f"the recording of run {recording.run.id!r} was not made against the model")
@@ -97,19 +182,19 @@ def measured_axis(section: Section, recordings: Sequence[Recording], *, step: fl
         if plan is None:
             notes.append(f"run {recording.run.id}: no GNSS positions on the section; not used for the axis")
             continue
-        right, sigma, relative = plan
-        if not sigma <= COARSEST:
-            notes.append(
-                f"run {recording.run.id}: its smoothed positions are good to {_mm(sigma)}, not to {_mm(COARSEST)}; not used for the axis"
-            )
+        if not plan.sigma <= COARSEST:
+            good = f"good to {_mm(plan.sigma)}, not to {_mm(COARSEST)}"
+            notes.append(f"run {recording.run.id}: its smoothed positions are {good}; not used for the axis")
             continue
-        parts.append((recording, _on(right, recording, grid), sigma, relative))
+        used.append(recording)
+        parts.append(replace(plan, values=_on(plan.values, recording, grid)))
         rise = _joined(recording, "height_gnss", "slope")
-        if rise is not None and rise[1] <= 2.0 * COARSEST:
-            rises.append((_on(rise[0], recording, grid), rise[1], rise[2]))
+        if rise is not None and rise.sigma <= 2.0 * COARSEST:
+            rises.append(replace(rise, values=_on(rise.values, recording, grid)))
     model = section.at(grid)
     if not parts:
-        sigma_cross, sigma_height = _model_sigma(section)
+        local_cross, local_height = _model_sigma(section, grid)
+        sigma_cross, sigma_height = _median(local_cross), _median(local_height)
         notes.append(
             "the measured axis is the model's own"
             + (
@@ -131,9 +216,13 @@ def measured_axis(section: Section, recordings: Sequence[Recording], *, step: fl
             math.nan,
             (),
             tuple(notes),
+            local_cross,
+            local_height,
         )
-    right, sigma_right, relative_right = _mean([(x, s, r) for _, x, s, r in parts])
-    up, sigma_up, relative_up = _mean(rises) if rises else (np.full(len(grid), np.nan), math.nan, math.nan)
+    right, local_right, relative_right, noise_right = _mean(parts)
+    unknown = np.full(len(grid), np.nan)
+    up, local_up, relative_up, noise_up = _mean(rises) if rises else (unknown, unknown, math.nan, ())
+    sigma_right, sigma_up = _median(local_right), _median(local_up)
     return MeasuredAxis(
         section,
         step,
@@ -144,13 +233,27 @@ def measured_axis(section: Section, recordings: Sequence[Recording], *, step: fl
         sigma_up,
         relative_right,
         relative_up,
-        tuple(dict.fromkeys(recording.run.id for recording, _, _, _ in parts)),
+        tuple(dict.fromkeys(recording.run.id for recording in used)),
         tuple(notes),
+        local_right,
+        local_up,
+        noise_right,
+        noise_up,
     )
 
 
-def _joined(recording: Recording, position: str, angle: str) -> tuple[FloatArray, float, float] | None:
-    """Displacement of one run on its grid, its sigma in place, and its sigma in shape."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Part:
+    """Displacement of one run, its sigma in place, its sigma in shape, and where the latter is from."""
+
+    values: FloatArray
+    sigma: float
+    relative: float
+    noise: AxisNoise
+
+
+def _joined(recording: Recording, position: str, angle: str) -> _Part | None:
+    """Displacement of one run on its own grid."""
     of = recording.series.get(position)
     if of is None or not np.isfinite(of.values).any():
         return None
@@ -161,7 +264,7 @@ def _joined(recording: Recording, position: str, angle: str) -> tuple[FloatArray
     slow = _slow(of, recording.step, wave)
     smooth = low_pass(of.values, recording.step, wave)
     if not fine or turn is None:
-        return smooth, math.hypot(white, slow), white
+        return _Part(smooth, math.hypot(white, slow), white, AxisNoise(of.noise, of.spacing, 0.0, 0.0, wave))
     shape = np.full(len(smooth), np.nan)
     for a, b in stretches(np.isfinite(turn.values)):
         if b - a < 8:
@@ -170,12 +273,11 @@ def _joined(recording: Recording, position: str, angle: str) -> tuple[FloatArray
         s = np.arange(b - a, dtype=float)
         integral -= np.polyval(np.polyfit(s, integral, 1), s)
         shape[a:b] = integral - low_pass(integral, recording.step, wave)
-    from railnav.monitoring.filters import Band
-
     relative = band_noise(turn.noise, turn.spacing, Band("shape", 3.0, wave), integrate=1)
     # of the positions' noise about a third lies in waves up to the crossover, where the smoothing lets go
     relative = math.hypot(relative, white / 3.0)
-    return smooth + shape, math.hypot(white, slow), relative
+    noise = AxisNoise(of.noise, of.spacing, turn.noise, turn.spacing, wave)
+    return _Part(smooth + shape, math.hypot(white, slow), relative, noise)
 
 
 def _slow(of: Series, step: float, wave: float) -> float:
@@ -197,33 +299,43 @@ def _on(values: FloatArray, recording: Recording, grid: FloatArray) -> FloatArra
     return out
 
 
-def _mean(parts: Sequence[tuple[FloatArray, float, float]]) -> tuple[FloatArray, float, float]:
-    """Weighted mean of runs where they are, and its sigmas where most of them are."""
-    weight = np.array([1.0 / max(sigma, 1e-6) ** 2 for _, sigma, _ in parts])
-    values = np.array([x for x, _, _ in parts])
+def _mean(parts: Sequence[_Part]) -> tuple[FloatArray, FloatArray, float, tuple[AxisNoise, ...]]:
+    """Weighted mean of runs where they are, its sigma place by place, that of its shape, and the noise of each run."""
+    weight = np.array([1.0 / max(part.sigma, 1e-6) ** 2 for part in parts])
+    values = np.array([part.values for part in parts])
     known = np.isfinite(values)
     total = (weight[:, None] * known).sum(axis=0)
-    mean = np.where(
-        total > 0, (weight[:, None] * np.where(known, values, 0.0)).sum(axis=0) / np.maximum(total, 1e-300), np.nan
-    )
-    least = float(np.median(total[total > 0])) if (total > 0).any() else math.nan
+    there = total > 0.0
+    safe = np.where(there, total, 1.0)
+    mean = np.where(there, (weight[:, None] * np.where(known, values, 0.0)).sum(axis=0) / safe, np.nan)
     share = weight / weight.sum()
-    relative = math.sqrt(float(np.sum((share * np.array([r for _, _, r in parts])) ** 2)))
-    return mean, 1.0 / math.sqrt(least) if least > 0 else math.nan, relative
+    relative = math.sqrt(float(np.sum((share * np.array([part.relative for part in parts])) ** 2)))
+    noise = tuple(replace(part.noise, share=float(s)) for part, s in zip(parts, share, strict=True))
+    return mean, np.where(there, 1.0 / np.sqrt(safe), np.nan), relative, noise
 
 
-def _model_sigma(section: Section) -> tuple[float, float]:
-    """Median sigma of the model's axis across and in height, m; NaN where it states none."""
+def _median(values: FloatArray) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else math.nan
+
+
+def _model_sigma(section: Section, grid: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Sigma of the model's axis across and in height along the section, m; NaN where it states none."""
     model = section.model
-    rows = np.concatenate([np.arange(model.knot_start[i], model.knot_start[i + 1]) for i in section.track])
-    ee, en, nn, uu = (model.covariance_g[rows, i] for i in (0, 1, 3, 5))
-    sin, cos = np.sin(model.grid_bearing[rows]), np.cos(model.grid_bearing[rows])
-    cross = ee * cos**2 - 2.0 * en * sin * cos + nn * sin**2
-    out = []
-    for variance in (cross, uu):
-        known = variance[np.isfinite(variance) & (variance >= 0.0)]
-        out.append(float(np.sqrt(np.median(known))) if len(known) else math.nan)
-    return out[0], out[1]
+    track, offset = section.locate(grid)
+    across, height = np.full(len(grid), np.nan), np.full(len(grid), np.nan)
+    for i in np.unique(track):
+        rows = slice(int(model.knot_start[i]), int(model.knot_start[i + 1]))
+        ee, en, nn, uu = (model.covariance_g[rows, k] for k in (0, 1, 3, 5))
+        sin, cos = np.sin(model.grid_bearing[rows]), np.cos(model.grid_bearing[rows])
+        cross = ee * cos**2 - 2.0 * en * sin * cos + nn * sin**2
+        here = track == i
+        at = offset[here] + model.offset[rows][0]
+        for out, variance in ((across, cross), (height, uu)):
+            good = np.isfinite(variance) & (variance >= 0.0)
+            if good.sum() > 1:
+                out[here] = np.sqrt(np.interp(at, model.offset[rows][good], variance[good]))
+    return across, height
 
 
 def _mm(value: float) -> str:

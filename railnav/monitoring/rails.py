@@ -116,7 +116,7 @@ def _banded(recording: Recording, of: str, band: Band) -> tuple[FloatArray, floa
     series: Series | None = recording.series.get(of)
     word = of.replace("_", " ")
     if series is None:
-        return f"the run has no {word}: the rails cannot be told from the axis"
+        return recording.refused.get(of, f"the run has no {word}: the rails cannot be told from the axis")
     if not series.spacing <= band.lower / SAMPLES_A_WAVE:
         return f"{word} was sampled each {series.spacing:.1f} m; {band.name} takes {band.lower / SAMPLES_A_WAVE:.1f} m"
     values = series.values

@@ -30,6 +30,8 @@ EARTH_RATE = 7.292115e-5
 GAUGES = (1.000, 1.067, 1.435, 1.520, 1.524, 1.600, 1.668, 1.676)
 #: A gauge outside nominal - 40 mm .. + 80 mm is no gauge, m.
 GAUGE_RANGE = (-0.040, 0.080)
+#: A gauge stream with a larger share of impossible samples than this is none.
+MOST_IMPOSSIBLE = 0.5
 #: Samples farther apart than this miss short defects (EN 13848-1 asks for no more, recalled), m.
 COARSEST_SAMPLING = 0.5
 #: A step from the neighbours' median below this is never an odd sample out, m: gauge and cant; and the factor of the robust sigma.
@@ -87,6 +89,8 @@ class Recording:
         m; NaN without a gauge stream.
     notes : tuple of str
         What the reader must know: biases found, samples rejected, offsets taken off.
+    refused : dict of str to str
+        Series that a stream should have given and did not, and why.
     """
 
     run: Run
@@ -100,6 +104,7 @@ class Recording:
     against_model: bool
     gauge_nominal: float = math.nan
     notes: tuple[str, ...] = field(default_factory=tuple)
+    refused: dict[str, str] = field(default_factory=dict)
 
     @property
     def covered(self) -> float:
@@ -149,9 +154,10 @@ def record(
         against_model = not bool(np.isfinite(model.covariance_g[knots]).any())
     series: dict[str, Series] = {}
     notes: list[str] = []
+    refused: dict[str, str] = {}
     nominal = math.nan
     if run.gauge is not None and len(run.gauge.time):
-        nominal = _gauge(run.gauge, passage, grid, gauge, series, notes)
+        nominal = _gauge(run.gauge, passage, grid, gauge, series, notes, refused)
     if run.gyro_angles is not None and len(run.gyro_angles.time):
         _angles(run.gyro_angles, passage, grid, against_model, series)
     if run.imu is not None and len(run.imu):
@@ -159,7 +165,9 @@ def record(
     if run.gnss is not None and len(run.gnss):
         _gnss(run.gnss, passage, grid, series, notes)
     points = passage.section.at(grid)
-    return Recording(run, passage, step, grid, time, speed, series, points, against_model, nominal, tuple(notes))
+    return Recording(
+        run, passage, step, grid, time, speed, series, points, against_model, nominal, tuple(notes), refused
+    )
 
 
 def inertial_curvature(rate: FloatArray, speed: FloatArray, *, slowest: float = SLOWEST) -> FloatArray:
@@ -220,6 +228,7 @@ def _gauge(
     wanted: float | None,
     series: dict[str, Series],
     notes: list[str],
+    refused: dict[str, str],
 ) -> float:
     d = passage.where(stream.time)
     if not np.isfinite(d).any():
@@ -233,12 +242,21 @@ def _gauge(
     odd = spikes(values, least=SPIKE) if fine else np.zeros(len(values), bool)
     here = np.isfinite(d)
     out = int((impossible & here).sum()), int((odd & here).sum())
-    series["gauge"] = _placed(d, np.where(odd, np.nan, values), grid, "gauge stream", sum(out))
+    if out[0] > MOST_IMPOSSIBLE * here.sum():
+        refused["gauge"] = (
+            f"{100.0 * out[0] / here.sum():.0f} % of the gauge samples lie outside {1e3 * (nominal + GAUGE_RANGE[0]):.0f} to "
+            f"{1e3 * (nominal + GAUGE_RANGE[1]):.0f} mm (median {1e3 * median:,.1f} mm): another unit, another gauge, or a broken sensor"
+        )
+        nominal = math.nan
+    else:
+        series["gauge"] = _placed(d, np.where(odd, np.nan, values), grid, "gauge stream", sum(out))
     if not fine:
         notes.append(
             f"gauge and cant were sampled each {_spacing(d):.1f} m: shorter defects are missed, and lone spikes not told from them"
         )
-    if sum(out):
+    if "gauge" in refused:
+        notes.append(f"gauge: {refused['gauge']}; not used")
+    elif sum(out):
         notes.append(
             f"gauge: {out[0]:,} samples outside {1e3 * (nominal + GAUGE_RANGE[0]):.0f} to {1e3 * (nominal + GAUGE_RANGE[1]):.0f} mm and "
             f"{out[1]:,} lone spikes of {int(here.sum()):,} were left out"

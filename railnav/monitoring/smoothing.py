@@ -116,12 +116,15 @@ class Bounds:
         Greatest third derivative of what is left of the deviation (of curvature: its rate), 1/m^2.
     ends : bool
         Whether the correction is zero at both ends, so that the work joins the track beyond.
+    ramp : float
+        Greatest correction over the distance from the nearer end, m/m, where `ends` holds.
     """
 
     least: float
     most: float
     third_difference: float
     ends: bool = True
+    ramp: float = math.inf
 
 
 def corrections(
@@ -179,7 +182,9 @@ def corrections(
         raise TrackError(f"{y.shape} deviations and {t.shape} targets; two rows of at least 8 finite values are needed")
     low, high = np.full(n, bounds.least), np.full(n, bounds.most)
     if bounds.ends:
-        low[[0, -1]] = high[[0, -1]] = 0.0
+        nearest = step * np.minimum(np.arange(n), n - 1 - np.arange(n))
+        most = np.where(nearest > 0.0, np.minimum(bounds.ramp, 1e9) * nearest, 0.0)
+        low, high = np.clip(low, -most, most), np.clip(high, -most, most)
     spans = [_rows(point, start, step, n) for point in fixed]
     inside = [(point, span) for point, span in zip(fixed, spans, strict=True) if span.stop > span.start]
     lows, highs = low.copy(), high.copy()

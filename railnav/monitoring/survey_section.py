@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -57,6 +58,8 @@ def measured_section(
         part = passage if passage.section is section else onto(passage, section)
         if part is not None:
             recordings.append(record(run, part, against_model=True))
+    there = {recording.run.id for recording in recordings}
+    notes = tuple(f"run {run.id}: does not touch section {section.name}" for run in runs if run.id not in there)
     if not recordings:
         ways = sorted({passage.section.name for _, passage in found})
         raise OffModelError(
@@ -64,4 +67,5 @@ def measured_section(
         )
     knots = np.concatenate([np.arange(model.knot_start[i], model.knot_start[i + 1]) for i in section.track])
     surveyed = bool(np.isfinite(model.covariance_g[knots]).any())
-    return measured_axis(section, recordings), surveyed
+    axis = measured_axis(section, recordings)
+    return replace(axis, notes=notes + axis.notes), surveyed

@@ -35,6 +35,7 @@ from railnav.matching._kernels import (
     POINT_SIZE,
     RECORD,
     VERSION,
+    clone,
     credit,
     drop,
     drop_all,
@@ -186,6 +187,9 @@ from railnav.navigation.dynamics._kernels import (
     project,
     reweigh_frame,
     robust_row,
+    stamps,
+    take_back,
+    timed,
     transition,
     variance_of,
     widen,
@@ -528,6 +532,32 @@ def jump(fil, shared, bank, work):
 
 
 @part
+def doubt_places(fil, bank, work):
+    """Give every hypothesis a twin that stands where the fix shows it: not the receiver stepped, the place was wrong (17, attribution).
+
+    Later fixes tell: an error that stepped fades, a place does not. The twins stand last among the living.
+    """
+    count = bank.live[0]
+    if 2 * count > bank.used.shape[0]:
+        return
+    for i in range(count):
+        h = bank.live[1 + i]
+        g = clone(bank, h)
+        for j in range(work.slot.shape[1]):
+            work.slot[g, j] = work.slot[h, j]
+        for j in range(work.point.shape[1]):
+            work.point[g, j] = work.point[h, j]
+        fix = work.fix[h]
+        te, tn = work.point[h, P_D_EAST], work.point[h, P_D_NORTH]
+        size = te * te + tn * tn
+        along = (fix[0] * te + fix[1] * tn) / size
+        variance = (fix[4] * te * te + 2.0 * fix[6] * te * tn + fix[5] * tn * tn) / (size * size)
+        bank.x[g, fil.at[POSITION]] += along
+        widen(bank.P_sqrt[g], fil.at[POSITION], math.sqrt(variance), work.vector[W_COLUMN])
+        work.slot[g, S_STRETCH] += along * along + variance
+
+
+@part
 def fix_all(fil, net, shared, bank, work, row):
     """Let a GNSS position into every hypothesis, or hold it as suspect when it fits none; gives whether it was let in."""
     k = fil.settings
@@ -570,7 +600,10 @@ def fix_all(fil, net, shared, bank, work, row):
     most = -np.inf
     i_g = at[GNSS_EAST]
     keep, move, before = work.vector[W_KEEP], work.vector[W_MOVE], work.vector[W_BEFORE]
-    for i in range(bank.live[0]):
+    count = bank.live[0]
+    if step > 0.0 and not timed(fil):
+        doubt_places(fil, bank, work)
+    for i in range(count):
         h = bank.live[1 + i]
         x, P_sqrt = bank.x[h], bank.P_sqrt[h]
         if step > 0.0:
@@ -591,12 +624,17 @@ def fix_all(fil, net, shared, bank, work, row):
         for j in range(n):
             before[j] = x[j]
         fix, h_north, f_north = work.fix[h], work.rows[h, 1], work.rows[h, 3]
+        told = stamps(fil, x, P_sqrt)
         absorb(x, P_sqrt, work.rows[h, 2], fix[0], fix[2], keep, move)
         innovation = fix[1]
         for j in range(n):
             innovation -= h_north[j] * (x[j] - before[j])
         project(P_sqrt, h_north, f_north)
         absorb(x, P_sqrt, f_north, innovation, fix[3], keep, move)
+        if tag == 0.0 and not timed(fil):
+            take_back(fil, x, P_sqrt, told, work.vector[W_COLUMN])
+    for i in range(count, bank.live[0]):  # a place that is wrong is as probable as a receiver that steps
+        work.slot[bank.live[1 + i], S_SAID] = work.slot[bank.live[1 + i - count], S_SAID]
     # the evidence of positions fades: errors longer than any correlation time must not add up to certainty
     since = time - common[C_FIX_TIME]
     top = -np.inf

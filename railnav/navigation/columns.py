@@ -212,9 +212,10 @@ OUTPUT_SIZE = 13
     C_ACCELEROMETER_FAULTS,
     C_ODOMETER_FAULTS,
     C_BLAMED,  # when wheel and receiver agreed against the accelerometer
+    C_BLAMED_WAY,  # how far it may have carried the train astray by then, m
     C_RESCALED,  # when the receiver confirmed the speed against the wheel for long
-) = range(56)
-COMMON_SIZE = 56
+) = range(57)
+COMMON_SIZE = 57
 #: How often tracks nearby that no hypothesis holds are given a rival, s.
 RIVAL_INTERVAL = 60.0
 #: Odometer readings remembered: time, distance.
@@ -237,6 +238,8 @@ LEAVING = 0.08
 KICK = 0.7
 #: Random walk of the speed while an accelerometer that should be there is silent, m/s^2/sqrt(Hz).
 SILENT_NOISE = 0.4
+#: How long a jump of the stamps is remembered where nothing but the fixes tells the time, s: loggers that lose a stamp find it again.
+TAG_MEMORY = 300.0
 #: Squared normalised innovation at which a single sensor row is held; its evidence saturates there.
 ROW_GATE = 16.0
 #: ln p of a balise that a hypothesis has no explanation for: read in error, or its place in the model is wrong.
@@ -258,6 +261,9 @@ COAST_LONGEST = 300.0
 ESTABLISHED = 60.0
 #: Yaw rates are no longer believed when this share of those of some seconds fits no hypothesis; and for how long then, s.
 YAW_MISFIT, YAW_SPAN, YAW_DISTRUST = 0.5, 2.0, 60.0
+#: A receiver's speed that the wheel confirms is against the filter's from this difference on, m/s: the former may be half a second old, but
+#: then a slipping wheel errs the other way.
+AGAINST = 0.4
 #: By how much an accelerometer's bias or a wheel's scale may have stepped when the other speeds agree against it.
 FORCE_STEP, SCALE_STEP = 0.3, 0.05
 #: How often dead reckoning by the wheel begins anew, s.
@@ -266,6 +272,10 @@ CHECK_INTERVAL = 60.0
 EVIDENCE_STEP = 1.0
 #: How much weaker the evidence of positions is when model or receiver are off by more than they say: sigmas five times as large.
 DOUBTED = 25.0
+#: Length over which the error of a model's bearing is the same, m.
+BEARING_LENGTH = 20.0
+#: A slope of the curvature this many times its error counts.
+SLOPES = 3.0
 #: Change of curvature a metre that the linearised course allows for, 1/m^2.
 BEND_CHANGE = 1e-5
 
@@ -327,6 +337,9 @@ class Filter(NamedTuple):
     signed: int  # 1: the odometer counts backwards when backing up
     map_sigma: float = 0.0  # usual error of the model across its tracks, m
     reads_balises: int = 0  # 1: the train has a reader: a balise passed in silence is evidence
+    slope: float = 0.0  # error of d(curvature)/ds: a slope no larger than that is no landmark, 1/m^2
+    turned: float = 1.0 / BLIND_LENGTH  # error of the model's bearing over that across, rad/m
+    canted: int = 1  # 0: the model does not know cant
 
 
 class Shared(NamedTuple):

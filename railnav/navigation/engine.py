@@ -17,6 +17,7 @@ from railnav.navigation import columns as c
 from railnav.navigation.epochs import kernel_table
 from railnav.navigation.integrity import normal_quantile
 from railnav.navigation.prior import USUAL, frame_prior, usual_directions
+from railnav.navigation.shape import shape_of
 from railnav.navigation.state import Settings, State, layout
 
 if TYPE_CHECKING:
@@ -104,6 +105,16 @@ class Engine:
                 gnss_frame_share=0.0 if self.frame.known else self.settings.gnss_frame_share,
             )
         self.network = pack_network(model)
+        shape = shape_of(model, self.network, gravity=self.settings.gravity)
+        self.network.knots[:, paths.CURVATURE] = shape.curvature
+        assumed = np.where(np.isnan(shape.sigma_curvature), self.settings.curvature_sigma, shape.sigma_curvature)
+        self.network = self.network._replace(sigma_bend=assumed)
+        self.settings = replace(
+            self.settings,
+            accelerometer_noise=math.hypot(self.settings.accelerometer_noise, shape.force_noise),
+            curvature_length=self.settings.curvature_length if math.isnan(shape.length) else shape.length,
+            curvature_shift=self.settings.curvature_shift if math.isnan(shape.shift) else shape.shift,
+        )
         self._loose = _loose_ends(model, self.network)
         self._unseen: dict[int, float] = {}
         middle, _, _ = model.frame.to_geodetic(model.easting[[0, -1]].mean(), model.northing[[0, -1]].mean(), None)
@@ -125,6 +136,9 @@ class Engine:
             int(signed_odometer),
             float(np.median(self.network.sigma_cross)),
             int(balises),
+            shape.slope,
+            shape.turned,
+            int(shape.canted),
         )
         self.bank = paths.Bank(
             np.zeros((SLOTS, n)),

@@ -162,8 +162,8 @@ class Settings:
     balise_missed : float
         Probability that a balise is passed and not read.
     curvature_sigma, curvature_shift, curvature_length : float
-        Errors of the model's curvature: of its value, 1/m, of the place where it changes, m, and the length over which both are
-        correlated, m.
+        Errors of the curvature of a model that states none of its own (see `railnav.navigation.shape`): of its value, 1/m, of the place
+        where it changes, m, and the length over which both are correlated, m.
     course_doubt : float
         Difference in bearing that does not tell one track from another, rad; a turnout's legs part by 0.05 and more.
     curvature_doubt : float

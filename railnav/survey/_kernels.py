@@ -363,3 +363,40 @@ def covariances(Rkk: FloatArray, Rkn: FloatArray, axis: FloatArray, lag: FloatAr
         for i in range(3):
             for j in range(3):
                 axis[k, i, j] = P[a + i, a + j]
+
+
+@njit(cache=True)
+def follow(cost: FloatArray, offset: FloatArray, joint: FloatArray, reach: float, leap: float, track: IntArray) -> None:
+    """Cheapest way of a run through tracks, fix by fix: a joint is passed where it lies, any other change costs `leap`."""
+    # cost, offset (n, S) of every fix on every track, offset in m, NaN where it is not on it; joint (j, 5): track, offset there, m,
+    # track, offset there, m, and what passing it costs; track (n,) filled
+    n, S = cost.shape
+    total = cost[0].copy()
+    came = np.empty((n, S), np.int16)
+    for i in range(1, n):
+        best = np.argmin(total)
+        new = np.empty(S)
+        for t in range(S):
+            came[i, t] = t
+            new[t] = total[t]
+            if total[best] + leap < new[t]:
+                came[i, t], new[t] = best, total[best] + leap
+        for j in range(joint.shape[0]):
+            for side in range(2):
+                a, b = int(joint[j, 2 * side]), int(joint[j, 2 - 2 * side])
+                here, place = offset[i, a], joint[j, 2 * side + 1]
+                before = offset[i - 1, a]
+                passed = np.isfinite(here) and np.isfinite(before) and (here - place) * (before - place) <= 0.0
+                over = not np.isfinite(here) and np.isfinite(before) and abs(before - place) < reach
+                there, toe = offset[i, b], joint[j, 3 - 2 * side]
+                last = offset[i - 1, b]
+                if np.isfinite(there):
+                    passed = passed or (np.isfinite(last) and (there - toe) * (last - toe) <= 0.0)
+                    over = over or (not np.isfinite(last) and abs(there - toe) < reach)
+                if (passed or over) and total[a] + joint[j, 4] < new[b]:
+                    came[i, b], new[b] = a, total[a] + joint[j, 4]
+        for t in range(S):
+            total[t] = new[t] + cost[i, t]
+    track[n - 1] = np.argmin(total)
+    for i in range(n - 1, 0, -1):
+        track[i - 1] = came[i, track[i]]

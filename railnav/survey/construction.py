@@ -317,14 +317,27 @@ def _assembled(
     provenance: dict[str, Any] = {"made_by": "railnav build"}
     if any(f.run.simulated for f in survey.fixes):
         provenance["simulated"] = True
+    fixed = sorted({f.run.gnss.fixed_to for f in survey.fixes if f.run.gnss is not None and f.run.gnss.fixed_to})
+    if fixed:  # one: several are refused at the start
+        provenance["fixed_to"] = fixed[0]
     sections, parts = join_tracks([t.name for t in tracks], tables, joins)
     text = report.compose(survey, tracks, offsets, heights, up, tables)
+    loose = [f.run.id for f in survey.fixes if f.run.gnss is not None and f.run.gnss.fixed_to not in fixed]
+    if fixed and loose:
+        text["warnings"].append(
+            f"the model is fixed to {fixed[0]}, but {', '.join(loose[:5])}{', ...' if len(loose) > 5 else ''} "
+            f"{'is' if len(loose) == 1 else 'are'} not: give fixed_to in every run.toml"
+        )
     if joins:
         text["parts"] = parts
         text["warnings"].append(
-            f"runs part in {len(joins)} places: turnouts were made there, and their tracks meet in nodes; such a model carries no survey "
-            "records, build it from all runs when there are new ones"
+            f"runs part in {len(joins)} places: turnouts were made there, and their tracks meet in nodes"
         )
-        return assemble(frame, sections, join_within=0.05, provenance={**provenance, "build": text})
-    records = keep_build(survey, tracks, offsets, heights, up)
-    return assemble(frame, sections, provenance={**provenance, "build": text}, record_source=lambda: records)
+    records = keep_build(survey, tracks, joins, parts, offsets, heights, up)
+    return assemble(
+        frame,
+        sections,
+        join_within=0.05 if joins else 0.5,
+        provenance={**provenance, "build": text},
+        record_source=lambda: records,
+    )

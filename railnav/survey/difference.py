@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from railnav.errors import CrsError, ModelError
 from railnav.estimation.change import windows
 from railnav.estimation.gross_error import chi_square_limit
+from railnav.survey.changes import CLEAR, FEWEST_WINDOWS, WINDOW_LENGTH, WINDOW_NODES
 from railnav.survey.offsets import HOLD, robust_fit
-from railnav.survey.refining import CLEAR, FEWEST_WINDOWS, WINDOW_LENGTH, WINDOW_NODES
-from railnav.survey.updating import digest
+from railnav.survey.stored import digest
 from railnav.track.model import TrackModel
 from railnav.track.records import AxisRecords, ModelRecords
 

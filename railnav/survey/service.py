@@ -311,7 +311,7 @@ def _moved(model: TrackModel, chains: list[MapChain], told: list[dict[str, Any]]
     """The model with every axis where its chain says it lies; tracks that meet still meet."""
     from scipy.interpolate import CubicSpline
 
-    from railnav.survey.updating import with_tables
+    from railnav.survey.renewal import with_tables
 
     touched = {name for entry in told for name in entry["tracks"]}
     shift: dict[int, FloatArray] = {}

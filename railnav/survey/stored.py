@@ -7,6 +7,7 @@ of theta. The rest enters the covariances of the nodes; the chain that is kept i
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from railnav.estimation.merging import ChainRecords
 from railnav.estimation.square_root import inverse_root
 from railnav.survey.axis import ErrorModel, Estimate
+from railnav.survey.layout import Join
 from railnav.survey.offsets import Offsets
 from railnav.survey.report import Survey
 from railnav.survey.surveyed import Surveyed
@@ -23,6 +25,16 @@ from railnav.survey.vertical import Heights
 from railnav.track.records import AxisRecords, Borders, ModelRecords, TrackRecords
 
 FloatArray = NDArray[np.float64]
+
+
+def digest(records: ModelRecords) -> str:
+    """Fingerprint of stored records: which model an update came from."""
+    h = hashlib.sha256()
+    for name in sorted(records.tracks):
+        t = records.tracks[name]
+        for a in (t.easting, t.northing, t.across.rows):
+            h.update(np.ascontiguousarray(a, "<f8").tobytes())
+    return h.hexdigest()[:16]
 
 
 def mean_of(blocks: Sequence[int], weights: Sequence[float], size: int, B: int) -> FloatArray:
@@ -77,6 +89,8 @@ def model_words(model: ErrorModel, scatter: float) -> dict[str, float]:
 def keep_build(
     survey: Survey,
     tracks: Sequence[Surveyed],
+    joins: Sequence[Join],
+    parts: dict[str, list[str]],
     offsets: Offsets,
     heights: Sequence[Heights | None],
     up: Offsets | None,
@@ -108,7 +122,6 @@ def keep_build(
         for c, name in enumerate(names):
             if name in high[0][1].models:
                 told[name]["up"] = model_words(high[0][1].models[name], float(up.scatter[c]))
-    home = {i: t.name for t in tracks for i in t.runs}
     return ModelRecords(
         tracks=kept,
         across=_borders([t.name for t in tracks], [t.runs for t in tracks], names, offsets),
@@ -119,10 +132,15 @@ def keep_build(
                 "id": f.run.id,
                 "start": f.run.start.isoformat(),
                 "direction": f.run.direction,
-                "tracks": [home[i]] if i in home else [],
+                "tracks": [t.name for t in tracks if i in t.runs],
             }
             for i, f in enumerate(survey.fixes)
         ),
+        joins=tuple(
+            {"track": j.track, "end": j.end, "parent": j.parent, "easting_m": j.easting, "northing_m": j.northing}
+            for j in joins
+        ),
+        parts=parts,
     )
 
 

@@ -114,7 +114,7 @@ def ways_of_line(value: FloatArray, design: FloatArray, step: float) -> list[Way
                         way.last, way.finish = toe, (other, toe)
                     _cut_member(ways[other], k, beyond, toe, end)
                     break
-        way.members = [(j, way.first if j == k else u, way.last if j == k else v) for j, u, v in way.members]
+        way.members = [_from_toe(ways, number, j, u, v, k, step) for j, u, v in way.members]
     return ways
 
 
@@ -264,6 +264,27 @@ def _toe(level: FloatArray, other: Way, run: int, node: int, ahead: int, step: f
             if slope * ahead > 0:
                 return float(np.clip(root, node - reach, node + reach))
     return float(node - ahead * 15.0 / step)
+
+
+def _from_toe(
+    ways: Sequence[Way], number: int, run: int, first: float, last: float, leader: int, step: float
+) -> tuple[int, float, float]:
+    """A run's stretch on a way that springs from others: it too begins and ends at the toes, and no sooner leaves the other way."""
+    way, reach = ways[number], TOE_REACH / step
+    edges = [first, last]
+    for end, spring, own in ((0, way.start, way.first), (1, way.finish, way.last)):
+        if spring is None:
+            continue
+        other, toe = spring
+        away = 1 if end == 0 else -1
+        if run == leader:
+            edges[end] = own
+        elif abs(edges[end] - toe) <= reach:
+            beyond = edges[end] - away
+            if any(j == run and u - 2 <= beyond <= v + 2 for j, u, v in ways[other].members):
+                _cut_member(ways[other], run, int(beyond), toe, end)
+                edges[end] = toe
+    return run, edges[0], edges[1]
 
 
 def _cut_member(way: Way, run: int, beyond: int, toe: float, end: int) -> None:

@@ -8,6 +8,10 @@ slope, second derivative), whitened rows that state what all surveys together kn
 c is the frame offset that the runs of the track had in common, D its effect on the axis. What the c of all tracks and the frame
 offsets of the kinds of receiver have to do with each other are rows as well (`Borders`). The nodes are the estimates, so all
 right-hand sides are zero.
+
+Where tracks spring from each other (turnouts), each keeps the chain of its own fixes, every fix in one of them: nothing is counted
+twice. A model's track between two nodes may then be a part of such a surveyed track; `ModelRecords.parts` says which, and
+`ModelRecords.joins` where ends are drawn onto other tracks.
 """
 
 from __future__ import annotations
@@ -128,7 +132,7 @@ class ModelRecords:
     Attributes
     ----------
     tracks : dict
-        `TrackRecords` by track identifier.
+        `TrackRecords` by the name of the surveyed track: the model's track, or one that turnouts part into several (`parts`).
     across, up : Borders, Borders or None
         What is known of the frame offsets in the plane and in height.
     receivers : dict
@@ -136,6 +140,11 @@ class ModelRecords:
         `correlated_m`, `correlation_time_s`, `total_m`}. JSON values.
     runs : tuple of dict
         The runs in it: `id`, `start`, `tracks`. JSON values.
+    joins : tuple of dict
+        Ends of surveyed tracks that spring from another one: `track`, `end` (0 start, 1 finish), `parent`, `easting_m`, `northing_m`.
+        JSON values.
+    parts : dict
+        The model's tracks, in order, that a surveyed track became where turnouts part it. JSON values.
     """
 
     tracks: dict[str, TrackRecords]
@@ -143,6 +152,16 @@ class ModelRecords:
     up: Borders | None
     receivers: dict[str, Any] = field(default_factory=dict)
     runs: tuple[dict[str, Any], ...] = ()
+    joins: tuple[dict[str, Any], ...] = ()
+    parts: dict[str, list[str]] = field(default_factory=dict)
+
+    def sections(self, track: str) -> list[str]:
+        """The model's tracks that a surveyed track consists of, in order."""
+        return list(self.parts.get(track, [track]))
+
+    def surveyed(self, section: str) -> str:
+        """The surveyed track that a track of the model belongs to; its own name where it is whole, or unknown."""
+        return next((name for name, parts in self.parts.items() if section in parts), section)
 
 
 #: Gives the records of a model when they are asked for.

@@ -8,30 +8,28 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from railnav.monitoring.quality import COMBINED
+from railnav.monitoring.rails import axis_key, rail_key
 from railnav.web import figures, words
+from railnav.web.geometry_tables import SHOWN, ability_section, quality_section, runs_section, trend_section
 from railnav.web.page import Card, Figure, Section, Table, Warnings, page
+from railnav.web.strips import Curve, Strip, axis_of, line_map, resolution_of, stack
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from railnav.monitoring.channel import Channel
     from railnav.monitoring.channels import Geometry
     from railnav.monitoring.limits import Exceedance
     from railnav.monitoring.monitor import Monitored, Report
-    from railnav.monitoring.section import Section as TrackSection
 
 FloatArray = NDArray[np.float64]
 
-#: Points of one curve of a strip chart.
-POINTS = 5000
 #: Sections drawn with charts; the others stand in the tables.
 DRAWN = 3
 #: Runs drawn over each other in one strip.
 RUNS = 6
 #: Rows of the table of exceedances on the page.
 ROWS = 200
-#: Height of one strip, pixels.
-STRIP = 92
 LEVEL_COLOURS = {"alert": "#e0a030", "intervention": "#d9622b", "immediate": "#b02323"}
 LEVEL_WORDS = {"alert": "alert", "intervention": "intervention", "immediate": "immediate action"}
 #: Strips from top to bottom.
@@ -41,17 +39,27 @@ ORDER = (
     "cross_level",
     "cross_level_deviation",
     "twist_",
+    "longitudinal_level_d0",
     "longitudinal_level_d1",
     "longitudinal_level_d2",
     "longitudinal_level_d3",
     "alignment_d1",
     "alignment_d2",
     "alignment_d3",
+    "versine_",
     "plan_deviation",
     "height_deviation",
 )
-#: Factor and word of the unit that a page shows.
-SHOWN = {"m": (1e3, "mm"), "m/m": (1e3, "mm/m"), "1/m": (1e3, "1/km")}
+#: Values as measured that travel along for zooming, all curves together.
+FINE = 12_000_000
+#: Standard deviations drawn, with their colour and what it is called.
+SPREAD = {
+    COMBINED: (figures.INK, "black"),
+    "longitudinal_level_d1": (figures.PALETTE[0], "blue"),
+    "alignment_d1": (figures.PALETTE[1], "orange"),
+}
+#: Endings of the keys of channels in bands.
+BANDS = ("d0", "d1", "d2", "d3")
 
 
 def geometry_page(report: Report) -> str:
@@ -79,24 +87,23 @@ def geometry_page(report: Report) -> str:
     latest = {part.section.name: _latest(part) for part in report.sections}
     shown = [e for part in report.sections for e in part.exceedances if e.run == latest[part.section.name]]
     first = report.sections[0]
-    sections: list[Section] = [_map(report, shown)]
+    places = _Places(report)
+    sections: list[Section] = [_map(report, shown, places)]
     warnings = [*report.notes, *_table_warning(report)]
     if warnings:
         sections.insert(0, Section("What to know first", "", [Warnings(warnings)]))
+    budget = FINE
     for i, part in enumerate(report.sections[:DRAWN]):
-        sections.append(
-            Section(
-                f"Channels: {part.section.name}",
-                _strip_words(part, i == 0),
-                [strips(part, identity=f"strips{i}", moves=i == 0)],
-            )
-        )
-    sections.append(_exceedance_section(shown, len(found)))
-    sections.append(_ability_section(report))
-    sections.append(_quality_section(report))
+        figure = strips(part, identity=f"strips{i}", budget=budget)
+        if figure.fine is not None:
+            budget -= figure.fine["count"] * len(figure.fine["traces"])
+        sections.append(Section(f"Channels: {part.section.name}", _strip_words(part, i == 0), [figure]))
+    sections.append(_exceedance_section(shown, len(found), places))
+    sections.append(ability_section(report))
+    sections.append(quality_section(report))
     if any(part.trends for part in report.sections):
-        sections.append(_trend_section(report))
-    sections.append(_runs_section(report))
+        sections.append(trend_section(report))
+    sections.append(runs_section(report))
     counts = {level: sum(e.level == level for e in shown) for level in LEVEL_COLOURS}
     cards = [
         Card("Sections", f"{len(report.sections)}", words.length(sum(p.section.length for p in report.sections), 4)),
@@ -119,15 +126,7 @@ def geometry_page(report: Report) -> str:
     )
 
 
-def axis_of(section: TrackSection, distance: FloatArray) -> tuple[FloatArray, str]:
-    """Kilometres to draw along: the chainage where the model has one that grows steadily, otherwise the distance."""
-    chainage = section.at(distance).chainage
-    if np.isfinite(chainage).all() and (np.diff(chainage) > 0.0).all():
-        return chainage / 1e3, "chainage, km"
-    return distance / 1e3, f"km along {section.name}"
-
-
-def strips(part: Monitored, *, identity: str, moves: bool = False) -> Figure:
+def strips(part: Monitored, *, identity: str, budget: int = 0) -> Figure:
     """Draw the channels of a section's runs one above another on one axis along the line.
 
     Parameters
@@ -135,75 +134,92 @@ def strips(part: Monitored, *, identity: str, moves: bool = False) -> Figure:
     part : Monitored
     identity : str
         Of the figure in the page.
-    moves : bool
-        Whether hovering moves the marker in the map.
+    budget : int
+        How many values may travel along for zooming; the latest run's come first.
 
     Returns
     -------
     Figure
     """
-    keys = sorted({key for g in part.geometries for key in g.channels}, key=_rank)
-    data: list[dict[str, Any]] = []
-    x, title = axis_of(part.section, part.geometries[0].distance)
-    layout = figures._layout(STRIP * (len(keys) + 1) + 110, hovermode="x")
-    height = 1.0 / (len(keys) + 1)
     newest = _by_date(part)[-RUNS:]
-    for row, key in enumerate(["speed", *keys]):
-        top = 1.0 - row * height
-        axis = "y" if row == 0 else f"y{row + 1}"
-        domain = [top - height * 0.86, top]
-        label, factor, unit = "Speed", 3.6, "km/h"
-        for j, geometry in enumerate(newest):
-            values: FloatArray
-            if key == "speed":
-                values = geometry.recording.speed * factor
-            elif key in geometry.channels:
-                channel = geometry.channels[key]
-                factor, unit = _shown(part, key)
-                label = channel.title
-                nominal = geometry.recording.gauge_nominal if key == "gauge" else 0.0
-                values = (channel.values - nominal) * factor
-            else:
-                continue
-            rows = figures.thin(POINTS, values)
-            colour = figures.INK if len(newest) == 1 else figures.PALETTE[j % len(figures.PALETTE)]
-            data.append(
-                figures._line(
-                    escape(f"{geometry.recording.run.start:%Y-%m-%d} {geometry.recording.run.id}"),
-                    x[rows],
-                    values[rows],
-                    colour,
-                    yaxis=axis,
-                    line={"width": 1.0},
-                    showlegend=row == 0,
-                    legendgroup=geometry.recording.run.id,
-                    connectgaps=False,
-                    hovertemplate=f"%{{y:.2f}} {unit}<extra>{escape(geometry.recording.run.id)}</extra>",
+    latest = newest[-1].recording.run.id
+    keys = [key for key in sorted({key for g in newest for key in g.channels}, key=_rank) if _drawn(part, key)]
+    x, _ = axis_of(part.section, part.geometries[0].distance)
+    drawn = []
+    for key in ("speed", *keys):
+        having = [g for g in newest if key == "speed" or key in g.channels]
+        factor, unit = (3.6, "km/h") if key == "speed" else _shown(part, key)
+        name = "Speed" if key == "speed" else _short(having[-1].channels[key].title)
+        curves = []
+        for geometry in reversed(having):
+            values, sigma = _values(geometry, key, factor)
+            budget -= len(values)
+            j = newest.index(geometry)
+            run = geometry.recording.run
+            curves.append(
+                Curve(
+                    f"{run.start:%Y-%m-%d} {run.id}",
+                    x,
+                    values,
+                    figures.INK if len(newest) == 1 else figures.PALETTE[j % len(figures.PALETTE)],
+                    label=run.id,
+                    group=run.id,
+                    legend=key == "speed",
+                    fine=resolution_of(sigma, float(np.nanstd(values)) if np.isfinite(values).any() else 0.0)
+                    if budget >= 0
+                    else 0.0,
                 )
             )
-        data += _marks(part, key, x, axis, factor, newest[-1].recording.run.id)
-        name = "yaxis" if row == 0 else f"yaxis{row + 1}"
-        layout[name] = figures._axis("", domain=domain, nticks=4, zeroline=True, fixedrange=False)
-        layout.setdefault("annotations", []).append(
-            {
-                "text": f"{escape(_short(label))}, {unit}",
-                "xref": "paper",
-                "yref": "paper",
-                "x": 0.002,
-                "y": top,
-                "xanchor": "left",
-                "yanchor": "top",
-                "showarrow": False,
-                "font": {"size": 12, "color": figures.SOFT},
-                "bgcolor": "rgba(255,255,255,0.75)",
-            }
+        drawn.append(
+            Strip(
+                f"{name}, {unit}", curves[::-1], _marks(part, key, x, factor, latest), _limit_lines(part, key, factor)
+            )
         )
-        limit = _limit_lines(part, key, factor, axis)
-        layout.setdefault("shapes", []).extend(limit)
-    layout["xaxis"] = figures._axis(
-        title, anchor=f"y{len(keys) + 1}", domain=[0, 1], showspikes=True, spikemode="across"
+    spread = _spread(part, latest, x)
+    return stack(
+        [*drawn, *([spread] if spread else [])],
+        identity=identity,
+        section=part.section,
+        distance=part.geometries[0].distance,
     )
-    return Figure(identity, data, layout, moves=moves)
+
+
+def _drawn(part: Monitored, key: str) -> bool:
+    """Whether a channel has a strip: short waves by rail, longer ones by axis, and any that is beyond a limit."""
+    axis = axis_key(key)
+    if any(e.channel == key for e in part.exceedances):
+        return True
+    rails = (
+        any(rail_key(axis, "left") in g.channels for g in part.geometries)
+        if axis.rsplit("_", 1)[-1] in BANDS
+        else False
+    )
+    return (key != axis) == (rails and axis.endswith(("_d0", "_d1")))
+
+
+def _values(geometry: Geometry, key: str, factor: float) -> tuple[FloatArray, float]:
+    """Values as shown, and their sigma."""
+    if key == "speed":
+        return geometry.recording.speed * factor, 0.1
+    channel = geometry.channels[key]
+    nominal = geometry.recording.gauge_nominal if key == "gauge" else 0.0
+    return (channel.values - nominal) * factor, channel.sigma * factor
+
+
+def _spread(part: Monitored, run: str, x: FloatArray) -> Strip | None:
+    """Standard deviations over 200 m of the latest run, as steps."""
+    index = next(i for i, g in enumerate(part.geometries) if g.recording.run.id == run)
+    graded = part.segments[index]
+    distance = part.geometries[0].distance
+    curves, names = [], []
+    for key, (colour, word) in SPREAD.items():
+        mine = [s for s in graded if s.channel == key]
+        if mine:
+            at = np.array([[s.start, s.finish, s.finish] for s in mine]).ravel()
+            level = np.array([[1e3 * s.deviation, 1e3 * s.deviation, np.nan] for s in mine]).ravel()
+            curves.append(Curve(mine[0].title, np.interp(at, distance, x), level, colour))
+            names.append(f"{mine[0].title} ({word})")
+    return Strip(f"Standard deviation over 200 m: {', '.join(names)}, mm", curves) if curves else None
 
 
 def _shown(part: Monitored, key: str) -> tuple[float, str]:
@@ -229,7 +245,12 @@ def _short(title: str) -> str:
 
 def _rank(key: str) -> tuple[int, str]:
     return next(
-        (i for i, start in enumerate(ORDER) if key == start or (start.endswith("_") and key.startswith(start))), 99
+        (
+            i
+            for i, start in enumerate(ORDER)
+            if axis_key(key) == start or (start.endswith("_") and key.startswith(start))
+        ),
+        99,
     ), key
 
 
@@ -241,7 +262,7 @@ def _latest(part: Monitored) -> str:
     return _by_date(part)[-1].recording.run.id
 
 
-def _marks(part: Monitored, key: str, x: FloatArray, axis: str, factor: float, run: str) -> list[dict[str, Any]]:
+def _marks(part: Monitored, key: str, x: FloatArray, factor: float, run: str) -> list[dict[str, Any]]:
     """Exceedances of the latest run as dots on their strip."""
     distance = part.geometries[0].distance
     traces = []
@@ -250,99 +271,70 @@ def _marks(part: Monitored, key: str, x: FloatArray, axis: str, factor: float, r
         if here:
             traces.append(
                 {
-                    "type": "scatter",
-                    "mode": "markers",
                     "name": LEVEL_WORDS[level],
                     "x": np.interp([e.peak for e in here], distance, x),
                     "y": [e.value * factor for e in here],
-                    "yaxis": axis,
                     "marker": {"size": 7, "color": colour, "symbol": "diamond"},
-                    "showlegend": False,
                     "hovertemplate": f"%{{y:.1f}}<extra>{LEVEL_WORDS[level]} limit</extra>",
                 }
             )
     return traces
 
 
-def _limit_lines(part: Monitored, key: str, factor: float, axis: str) -> list[dict[str, Any]]:
+def _limit_lines(part: Monitored, key: str, factor: float) -> list[tuple[float, str]]:
     """Limits that were exceeded, as lines on their strip; others would flatten the curve."""
+    return [
+        (limit * factor, colour)
+        for level, colour in LEVEL_COLOURS.items()
+        for limit in sorted({e.limit for e in part.exceedances if e.channel == key and e.level == level})
+    ]
+
+
+def _map(report: Report, shown: Sequence[Exceedance], places: _Places) -> Section:
     lines = []
-    for level, colour in LEVEL_COLOURS.items():
-        values = {e.limit for e in part.exceedances if e.channel == key and e.level == level}
-        stroke = {"color": colour, "width": 1, "dash": "dot"}
-        lines += [
-            {
-                "type": "line",
-                "xref": "paper",
-                "x0": 0,
-                "x1": 1,
-                "yref": axis,
-                "y0": y * factor,
-                "y1": y * factor,
-                "line": stroke,
-            }
-            for y in sorted(values)
-        ]
-    return lines
-
-
-def _map(report: Report, shown: Sequence[Exceedance]) -> Section:
-    plan = figures.plan(report.model)
-    east0, north0, _, _ = figures._corner(report.model, None)
-    data = list(plan.data)
-    for part in report.sections:
+    for i, part in enumerate(report.sections):
         d = np.linspace(0.0, part.section.length, int(min(4000, part.section.length / 5.0)) + 2)
         point = part.section.at(d)
-        rows = figures.outline(point.easting, point.northing, 0.5)
-        data.append(
-            figures._line(
-                escape(part.section.name),
-                (point.easting[rows] - east0) / 1e3,
-                (point.northing[rows] - north0) / 1e3,
-                figures.ESTIMATE,
-                line={"width": 2.5},
-                hoverinfo="skip",
-                showlegend=False,
-            )
-        )
+        chart = f"strips{i}" if i < DRAWN else ""
+        x = np.interp(d, *places.grid[chart]) if chart else d
+        lines.append((chart, part.section.name, x, point.easting, point.northing))
+    marks = []
     for level, colour in LEVEL_COLOURS.items():
         here = [e for e in shown if e.level == level]
         if here:
-            data.append(
+            marks.append(
                 {
-                    "type": "scatter",
-                    "mode": "markers",
                     "name": f"{LEVEL_WORDS[level]} limit",
-                    "x": [(e.easting - east0) / 1e3 for e in here],
-                    "y": [(e.northing - north0) / 1e3 for e in here],
+                    "easting": np.array([e.easting for e in here]),
+                    "northing": np.array([e.northing for e in here]),
                     "text": [f"{escape(e.title)} {_value(e)}<br>{escape(e.track)} at {e.offset:.0f} m" for e in here],
+                    "customdata": [places.of(e) for e in here],
                     "hovertemplate": "%{text}<extra></extra>",
                     "marker": {"size": 9, "color": colour, "symbol": "diamond"},
                 }
             )
-    first = report.sections[0].section
-    d = np.linspace(0.0, first.length, 2000)
-    point, (x, _) = first.at(d), axis_of(first, d)
-    marker: dict[str, Any] = {
-        "time": x,
-        "x": (point.easting - east0) / 1e3,
-        "y": (point.northing - north0) / 1e3,
-        "trace": len(data),
-    }
-    data.append(
-        {
-            "type": "scatter",
-            "mode": "markers",
-            "name": "place",
-            "x": [marker["x"][0]],
-            "y": [marker["y"][0]],
-            "marker": {"size": 14, "color": figures.WRONG, "line": {"width": 2, "color": "#fff"}},
-            "hoverinfo": "skip",
-            "showlegend": False,
-        }
+    text = (
+        "Sections monitored are blue, exceedances of the latest run diamonds. The pointer on a strip chart moves the dot, zooming a chart "
+        "marks the stretch in view, and a click on a diamond leads to its place on the chart."
     )
-    text = "Sections monitored are blue, exceedances of the latest run diamonds. The pointer on the first strip chart moves the dot."
-    return Section("Map", text, [Figure("plan", data, plan.layout, marker=marker)])
+    return Section("Map", text, [line_map(report.model, lines, marks=marks)])
+
+
+class _Places:
+    """Where an exceedance stands on the charts of a page."""
+
+    def __init__(self, report: Report) -> None:
+        self.chart: dict[int, str] = {}
+        self.grid: dict[str, tuple[FloatArray, FloatArray]] = {}
+        for i, part in enumerate(report.sections[:DRAWN]):
+            grid = part.geometries[0].distance
+            self.grid[f"strips{i}"] = grid, axis_of(part.section, grid)[0]
+            self.chart |= {id(e): f"strips{i}" for e in part.exceedances}
+
+    def of(self, found: Exceedance) -> tuple[str, float] | None:
+        """The chart that shows an exceedance, and the place on its axis; None where its section is not drawn."""
+        chart = self.chart.get(id(found))
+        return None if chart is None else (chart, float(np.interp(found.peak, *self.grid[chart])))
 
 
 def _value(found: Exceedance) -> str:
@@ -398,10 +390,17 @@ def _strip_words(part: Monitored, moves: bool) -> str:
         if against
         else "The model was surveyed: its shape is not taken off longitudinal level and alignment, so transitions show in long waves."
     )
-    return text + (" Dotted lines are the limits that were exceeded." if moves else "")
+    more = " Dotted lines are the limits that were exceeded. Drag across the chart to zoom in: the values then shown are those each "
+    return text + (f"{more}{part.geometries[0].recording.step:g} m; a double click leads back." if moves else "")
 
 
-def _exceedance_section(shown: Sequence[Exceedance], total: int) -> Section:
+def _exceedance_section(shown: Sequence[Exceedance], total: int, places: _Places) -> Section:
+    counts = []
+    for title in dict.fromkeys(e.title for e in sorted(shown, key=lambda e: _rank(e.channel))):
+        mine = [e for e in shown if e.title == title]
+        counts.append([title, *(f"{sum(e.level == level for e in mine):,}" for level in reversed(LEVEL_COLOURS))])
+    order = {level: i for i, level in enumerate(reversed(LEVEL_COLOURS))}
+    shown = sorted(shown, key=lambda e: (order[e.level], -abs(e.value / e.limit)))
     rows = [
         [
             e.title,
@@ -431,173 +430,10 @@ def _exceedance_section(shown: Sequence[Exceedance], total: int) -> Section:
         "northing",
         "status",
     )
-    text = f"{len(shown):,} places in the latest run of each section, {total:,} in all runs; the severest first."
+    text = f"{len(shown):,} places in the latest run of each section, {total:,} in all runs; the severest first, by how far they are "
+    text += "beyond their limit. A click on a row leads to its place on the chart."
     if len(shown) > ROWS:
         text += f" The first {ROWS} stand here; --exceedances writes all of them."
-    return Section("Exceedances", text, [Table(columns, rows, left=3)] if rows else [])
-
-
-def _ability_section(report: Report) -> Section:
-    """Which channels and bands the runs can bear, and which not."""
-    merged: dict[tuple[str, str, str, str], list[tuple[str, Channel | None]]] = {}
-    for part in report.sections:
-        for geometry, verdicts in zip(part.geometries, part.verdicts, strict=True):
-            run = geometry.recording.run.id
-            for v in verdicts:
-                channel = geometry.channels.get(v.channel)
-                judged = (words.share(round(v.share, 2)) if not v.reason else "channel only") if channel else "no"
-                merged.setdefault((v.title, channel.source if channel else "", v.reason, judged), []).append(
-                    (run, channel)
-                )
-            named = {v.channel for v in verdicts}
-            for name, reason in geometry.refused.items():
-                if name not in named:
-                    merged.setdefault((name.replace("_", " "), "", reason, "no"), []).append((run, None))
-    text = (
-        "A band is given where its shortest wave is sampled three times, and judged where the noise is at most a third of the "
-        "mildest limit. Sigma is that of the samples' white noise, at most, and in bands of the place; long-wave distances from the "
-        "model by GNSS state their whole scatter. Sensors on a sprung body do not show the rails above some hertz."
-    )
-    columns = ("channel", "runs", "from", "why not judged", "sample each, m", "sigma at most", "judged")
-    rows = []
-    for (title, source, reason, judged), having in sorted(merged.items(), key=lambda item: item[0][0].lower()):
-        channels = [channel for _, channel in having if channel is not None]
-        runs = sorted({run for run, _ in having})
-        worst = max(channels, key=lambda c: c.sigma if np.isfinite(c.sigma) else -1.0) if channels else None
-        spacing = f"{max(c.spacing for c in channels):.2f}" if channels else ""
-        rows.append(
-            [
-                title,
-                f"{len(runs)} runs" if len(runs) > 2 else ", ".join(runs),
-                source,
-                reason,
-                spacing,
-                _sigma(worst),
-                judged,
-            ]
-        )
-    return Section("What these runs can bear", text, [Table(columns, rows, left=4)])
-
-
-def _sigma(channel: Channel | None) -> str:
-    if channel is None or not np.isfinite(channel.sigma):
-        return ""
-    factor, unit = SHOWN[channel.unit]
-    return f"{words.figures(channel.sigma * factor, 2)} {unit}"
-
-
-def _quality_section(report: Report) -> Section:
-    columns = (
-        "section",
-        "run",
-        "channel",
-        "segments",
-        "median",
-        "90 %",
-        "largest",
-        "over alert",
-        "A",
-        "B",
-        "C",
-        "D",
-        "E",
-    )
-    rows = []
-    for part in report.sections:
-        for geometry, graded in zip(part.geometries, part.segments, strict=True):
-            for key in dict.fromkeys(s.channel for s in graded):
-                mine = [s for s in graded if s.channel == key]
-                sd = 1e3 * np.array([s.deviation for s in mine])
-                over = sum(s.deviation > s.alert for s in mine)
-                graded_any = any(s.grade for s in mine)
-                rows.append(
-                    [
-                        part.section.name,
-                        geometry.recording.run.id,
-                        mine[0].title,
-                        f"{len(mine):,}",
-                        *(f"{v:.2f}" for v in (np.median(sd), np.quantile(sd, 0.9), sd.max())),
-                        f"{over:,}" if np.isfinite(mine[0].alert) else "",
-                        *((f"{sum(s.grade == g for s in mine):,}" if graded_any else "") for g in "ABCDE"),
-                    ]
-                )
-    text = "Standard deviations over segments of 200 m, mm, and how many segments fall into each class."
-    return Section("Quality", text, [Table(columns, rows, left=3)] if rows else [])
-
-
-def _trend_section(report: Report) -> Section:
-    rows = []
-    summary = []
-    for part in report.sections:
-        for trend in part.trends:
-            g = trend.growth
-            known = np.isfinite(g.rate)
-            summary.append(
-                f"{trend.title}, {part.section.name}: {int(g.significant.sum())} of {int(known.sum())} segments change significantly; one "
-                f"standard deviation over 200 m repeats within {words.length(g.noise, 2)}."
-            )
-            for i in sorted(np.flatnonzero(g.significant), key=lambda k: -abs(g.rate[k]))[:25]:
-                track, offset = part.section.locate(trend.start[i])
-                rows.append(
-                    [
-                        trend.title,
-                        report.model.track_id[int(track)],
-                        f"{float(offset):,.0f}",
-                        f"{1e3 * trend.values[0, i]:.2f}",
-                        f"{1e3 * trend.values[-1, i]:.2f}",
-                        f"{1e3 * g.rate[i]:+.3f}",
-                        f"{1e3 * g.sigma[i]:.3f}",
-                        f"{g.probability[i]:.1e}",
-                    ]
-                )
-    columns = (
-        "channel",
-        "track",
-        "from offset, m",
-        "first, mm",
-        "last, mm",
-        "mm a month",
-        "sigma",
-        "probability by chance",
-    )
-    text = " ".join(summary) + " Significant: at most 5 % false findings among them (Benjamini and Hochberg)."
-    return Section("Trends", text, [Table(columns, rows, left=2)] if rows else [])
-
-
-def _runs_section(report: Report) -> Section:
-    rows = []
-    notes = []
-    for part in report.sections:
-        for geometry, lies in zip(part.geometries, part.overlays, strict=True):
-            r = geometry.recording
-            rows.append(
-                [
-                    r.run.id,
-                    part.section.name,
-                    f"{r.run.start:%Y-%m-%d}",
-                    words.length(r.covered * part.section.length, 4),
-                    words.share(r.covered),
-                    words.length(r.passage.sigma, 2),
-                    words.share(r.passage.probability),
-                    "reference" if lies is None else f"{len(lies.shift)} of {lies.windows}",
-                    "" if lies is None or not len(lies.shift) else f"{float(np.median(lies.shift)):+.2f} m",
-                    "" if lies is None else words.length(lies.scatter, 2),
-                ]
-            )
-            notes += [f"{r.run.id}, {part.section.name}: {note}" for note in r.notes]
-    columns = (
-        "run",
-        "section",
-        "date",
-        "covers",
-        "share",
-        "sigma along",
-        "track certain",
-        "overlay windows",
-        "shift found",
-        "left after",
-    )
-    parts: list[Table | Warnings] = [Table(columns, rows, left=3)]
-    if notes:
-        parts.append(Warnings(notes))
-    return Section("Runs", "Where each run lies on the model, and how it was laid over the others.", parts)
+    at = [places.of(e) for e in shown[:ROWS]]
+    summary = Table(("channel", *(LEVEL_WORDS[level] for level in reversed(LEVEL_COLOURS))), counts)
+    return Section("Exceedances", text, [summary, Table(columns, rows, left=3, at=at)] if rows else [])

@@ -9,22 +9,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railnav.web import figures, words
-from railnav.web.geometry import POINTS, STRIP, axis_of
 from railnav.web.page import Card, Figure, Section, Table, Warnings, page
+from railnav.web.strips import Curve, Strip, axis_of, line_map, stack
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from railnav.monitoring.lining import LiningPlan
+    from railnav.monitoring.smoothing import FixedPoint
 
 FloatArray = NDArray[np.float64]
+#: Resolution of values that travel along for zooming, mm.
+FINE = 0.01
 BEFORE, AFTER, MOVE = "#9aa7b1", "#1f77b4", "#d9822b"
 
 
-def lining_page(plan: LiningPlan) -> str:
+def lining_page(plan: LiningPlan, *, simulated: bool = False) -> str:
     """Compose the page of a lining plan.
 
     Parameters
     ----------
     plan : LiningPlan
+    simulated : bool
+        Whether a run was simulated; a simulated model is seen by itself.
 
     Returns
     -------
@@ -52,12 +59,10 @@ def lining_page(plan: LiningPlan) -> str:
             f"The track was measured by {words.count(len(plan.measured.runs), 'run')}, its place good to "
             f"{words.length(plan.measured.sigma_right, 2)} across and {words.length(plan.measured.sigma_up, 2)} in height (one sigma)."
         )
+    known = plan.sigma_slew[np.isfinite(plan.sigma_slew)]
+    if len(known):
+        lead += f" By the noise of its sensors a slew is good to {words.length(float(np.median(known)), 2)}."
     warnings = list(plan.notes)
-    if not plan.usable:
-        warnings.insert(
-            0,
-            "Not for a machine: the measured axis is not known well enough for slews of millimetres. It shows the method on these data.",
-        )
     sections = [Section("What to know first", "", [Warnings(warnings)])] if warnings else []
     sections += [
         _map(plan),
@@ -85,7 +90,7 @@ def lining_page(plan: LiningPlan) -> str:
     return page(
         f"Lining of {plan.section.name}",
         subtitle=", ".join(plan.measured.runs),
-        badge=SIMULATED if is_simulated(plan.section.model) else "",
+        badge=SIMULATED if simulated or is_simulated(plan.section.model) else "",
         lead=[lead],
         cards=cards,
         sections=sections,
@@ -103,152 +108,81 @@ def strips(plan: LiningPlan) -> Figure:
     -------
     Figure
     """
-    x, title = axis_of(plan.section, plan.distance)
-    curvature = plan.section.at(plan.distance).curvature * 1e3
-    rows: list[tuple[str, list[tuple[str, FloatArray, FloatArray, str, str]]]] = [
-        ("Model's curvature, 1/km", [("curvature", x, curvature, figures.INK, "solid")]),
-        (
-            "Right of the target line, mm" if plan.design else "Right of the base line, mm",
-            [
-                ("before", x, 1e3 * plan.right_before, BEFORE, "solid"),
-                ("after", x, 1e3 * plan.right_after, AFTER, "solid"),
-            ],
-        ),
-        (
+    d = plan.distance
+    x, _ = axis_of(plan.section, d)
+    classic = Curve(
+        "versine method", np.interp(plan.hallade_distance, d, x), 1e3 * plan.hallade_slew, figures.SOFT, "dot"
+    )
+    target = "target" if plan.design else "base"
+    drawn = [
+        Strip("Model's curvature, 1/km", [Curve("curvature", x, 1e3 * plan.section.at(d).curvature, figures.INK)]),
+        _before_after(f"Right of the {target} line, mm", x, plan.right_before, plan.right_after),
+        Strip(
             "Slew to the right, mm",
-            [("slew", x, 1e3 * plan.slew, MOVE, "solid")]
-            + (
-                [
-                    (
-                        "versine method",
-                        np.interp(plan.hallade_distance, plan.distance, x),
-                        1e3 * plan.hallade_slew,
-                        figures.SOFT,
-                        "dot",
-                    )
-                ]
-                if len(plan.hallade_distance)
-                else []
-            ),
+            [Curve("slew", x, 1e3 * plan.slew, MOVE, fine=FINE), *([classic] if len(plan.hallade_slew) else [])],
+            _fixed(plan.fixed_slew, d, x),
         ),
-        (
-            "Versine on 20 m, mm",
-            [
-                ("before", x, 1e3 * plan.versine_before, BEFORE, "solid"),
-                ("after", x, 1e3 * plan.versine_after, AFTER, "solid"),
-            ],
-        ),
+        _before_after("Versine on 20 m, mm", x, plan.versine_before, plan.versine_after),
     ]
     if np.isfinite(plan.lift).all():
-        rows += [
-            (
-                "Above the target profile, mm" if plan.design else "Above the base profile, mm",
-                [
-                    ("before", x, 1e3 * plan.up_before, BEFORE, "solid"),
-                    ("after", x, 1e3 * plan.up_after, AFTER, "solid"),
-                ],
-            ),
-            ("Lift, mm", [("lift", x, 1e3 * plan.lift, MOVE, "solid")]),
+        drawn += [
+            _before_after(f"Above the {target} profile, mm", x, plan.up_before, plan.up_after),
+            Strip("Lift, mm", [Curve("lift", x, 1e3 * plan.lift, MOVE, fine=FINE)], _fixed(plan.fixed_lift, d, x)),
         ]
-    layout = figures._layout(round(1.5 * STRIP) * len(rows) + 110, hovermode="x", showlegend=False)
-    data: list[dict[str, Any]] = []
-    height = 1.0 / len(rows)
-    for i, (label, curves) in enumerate(rows):
-        top = 1.0 - i * height
-        axis = "y" if i == 0 else f"y{i + 1}"
-        for name, at, values, colour, dash in curves:
-            kept = figures.thin(POINTS, values)
-            data.append(
-                figures._line(
-                    name,
-                    at[kept],
-                    values[kept],
-                    colour,
-                    yaxis=axis,
-                    line={"width": 1.1, "dash": dash},
-                    connectgaps=False,
-                    hovertemplate=f"%{{y:.1f}}<extra>{name}</extra>",
-                )
-            )
-        fixed = plan.fixed_slew if label.startswith("Slew") else plan.fixed_lift if label.startswith("Lift") else ()
-        if fixed:
-            middle = np.array([0.5 * (point.start + point.finish) for point in fixed])
-            data.append(
-                {
-                    "type": "scatter",
-                    "mode": "markers",
-                    "x": np.interp(middle, plan.distance, x),
-                    "y": [1e3 * point.correction for point in fixed],
-                    "error_y": {
-                        "type": "data",
-                        "array": [1e3 * point.tolerance for point in fixed],
-                        "color": figures.WRONG,
-                    },
-                    "text": [escape(point.name) for point in fixed],
-                    "hovertemplate": "%{text}<extra>fixed</extra>",
-                    "yaxis": axis,
-                    "marker": {"size": 8, "color": figures.WRONG, "symbol": "diamond"},
-                }
-            )
-        layout["yaxis" if i == 0 else f"yaxis{i + 1}"] = figures._axis("", domain=[top - 0.86 * height, top], nticks=5)
-        layout.setdefault("annotations", []).append(
-            {
-                "text": label,
-                "xref": "paper",
-                "yref": "paper",
-                "x": 0.002,
-                "y": top,
-                "xanchor": "left",
-                "yanchor": "top",
-                "showarrow": False,
-                "font": {"size": 12, "color": figures.SOFT},
-                "bgcolor": "rgba(255,255,255,0.75)",
-            }
-        )
-    layout["xaxis"] = figures._axis(title, anchor=f"y{len(rows)}", domain=[0, 1], showspikes=True, spikemode="across")
-    return Figure("strips", data, layout, moves=True)
+    return stack(drawn, identity="strips", section=plan.section, distance=d, height=140, legend=False)
+
+
+def _before_after(name: str, x: FloatArray, before: FloatArray, after: FloatArray) -> Strip:
+    curves = [Curve("before", x, 1e3 * before, BEFORE, fine=FINE), Curve("after", x, 1e3 * after, AFTER, fine=FINE)]
+    return Strip(name, curves, form=".1f")
+
+
+def _fixed(points: Sequence[FixedPoint], distance: FloatArray, x: FloatArray) -> list[dict[str, Any]]:
+    """Fixed points as diamonds with their tolerance."""
+    here = [p for p in points if distance[0] <= 0.5 * (p.start + p.finish) <= distance[-1]]
+    if not here:
+        return []
+    return [
+        {
+            "x": np.interp([0.5 * (p.start + p.finish) for p in here], distance, x),
+            "y": [1e3 * p.correction for p in here],
+            "error_y": {"type": "data", "array": [1e3 * p.tolerance for p in here], "color": figures.WRONG},
+            "text": [escape(p.name) for p in here],
+            "hovertemplate": "%{text}<extra>fixed</extra>",
+            "marker": {"size": 8, "color": figures.WRONG, "symbol": "diamond"},
+        }
+    ]
 
 
 def _map(plan: LiningPlan) -> Section:
-    drawn = figures.plan(plan.section.model)
-    east0, north0, _, _ = figures._corner(plan.section.model, None)
-    data = list(drawn.data)
     x, _ = axis_of(plan.section, plan.distance)
-    east, north = (plan.easting - east0) / 1e3, (plan.northing - north0) / 1e3
-    rows = figures.outline(plan.easting, plan.northing, 0.5)
-    data.append(
-        figures._line(
-            "lined", east[rows], north[rows], figures.ESTIMATE, line={"width": 2.5}, hoverinfo="skip", showlegend=False
-        )
-    )
-    kept = np.linspace(0, len(x) - 1, min(len(x), 2000)).astype(np.int64)
-    marker: dict[str, Any] = {"time": x[kept], "x": east[kept], "y": north[kept], "trace": len(data)}
-    data.append(
-        {
-            "type": "scatter",
-            "mode": "markers",
-            "name": "place",
-            "x": [east[0]],
-            "y": [north[0]],
-            "marker": {"size": 14, "color": figures.WRONG, "line": {"width": 2, "color": "#fff"}},
-            "hoverinfo": "skip",
-            "showlegend": False,
-        }
-    )
-    return Section(
-        "Map", "Moving the pointer along the charts moves the dot.", [Figure("plan", data, drawn.layout, marker=marker)]
-    )
+    line = ("strips", "lined", x, plan.easting, plan.northing)
+    text = "Moving the pointer along the charts moves the dot; zooming them marks the stretch in view."
+    return Section("Map", text, [line_map(plan.section.model, [line])])
 
 
 def _spread(plan: LiningPlan) -> Section:
+    strings = plan.hallade_spread
     rows = [
-        [name.replace("_", " "), band, f"{1e3 * before:.2f}", f"{1e3 * after:.2f}"]
+        [
+            name.replace("_", " "),
+            band,
+            f"{1e3 * before:.2f}",
+            f"{1e3 * after:.2f}",
+            f"{1e3 * strings[name, band][1]:.2f}" if (name, band) in strings else "",
+            f"{1e3 * plan.bears[name, band][0]:.3f}" if np.isfinite(plan.bears[name, band][0]) else "not known",
+            "yes" if plan.bears[name, band][1] else "no",
+        ]
         for (name, band), (before, after) in plan.spread.items()
     ]
-    text = "Standard deviation over the stretch, mm, of what was measured and of what is planned (the machine's own errors are not in it)."
-    return Section(
-        "Before and after", text, [Table(("channel", "band", "before", "after"), rows, left=2)] if rows else []
+    text = (
+        "Standard deviation over the stretch, mm, of what was measured and of what is planned (the machine's own errors are not in it). "
+        "By versines: what the classic method on half chords of 10 m would leave; it keeps no limits but the ends, and its slews drift "
+        "where small errors of versines add up. The axis bears corrections in a band where the noise of its sensors there is at most "
+        "a third of what was found."
     )
+    columns = ("channel", "band", "before", "after", "by versines", "sigma of the axis", "axis bears it")
+    return Section("Before and after", text, [Table(columns, rows, left=2)] if rows else [])
 
 
 def _limits(plan: LiningPlan) -> Section:
@@ -258,7 +192,7 @@ def _limits(plan: LiningPlan) -> Section:
         ["lifts", f"{1e3 * limit.least_lift:.0f} to {1e3 * limit.most_lift:.0f} mm"],
         ["change of curvature left, plan", f"{limit.curvature_rate:.1e} 1/m^2"],
         ["change of curvature left, profile", f"{limit.gradient_rate:.1e} 1/m^2"],
-        ["ends", "stay where they are"],
+        ["ends", f"stay; corrections begin and fade out by {1e3 * limit.ramp:g} mm a metre at most"],
     ]
     for what, points in (("slew", plan.fixed_slew), ("lift", plan.fixed_lift)):
         rows += [[f"{what} at {p.name}", f"{1e3 * p.correction:+.1f} +- {1e3 * p.tolerance:.1f} mm"] for p in points]

@@ -24,20 +24,21 @@
   const plan = document.getElementById("plan");
   const marker = plan && plan.figure.marker;
   if (!marker) return;
-  const nearest = function (time) {
-    let low = 0, high = marker.time.length - 1;
+  const nearest = function (times, time) {
+    let low = 0, high = times.length - 1;
     while (low < high) {
       const middle = (low + high) >> 1;
-      if (marker.time[middle] < time) low = middle + 1; else high = middle;
+      if (times[middle] < time) low = middle + 1; else high = middle;
     }
-    return low > 0 && time - marker.time[low - 1] < marker.time[low] - time ? low - 1 : low;
+    return low > 0 && time - times[low - 1] < times[low] - time ? low - 1 : low;
   };
   for (const figure of figures) {
-    if (!figure.moves) continue;
+    const along = marker.places ? marker.places[figure.id] : marker;
+    if (!figure.moves || !along) continue;
     drawn[figure.id].then(function (place) {
       place.on("plotly_hover", function (event) {
-        const k = nearest(event.points[0].x);
-        Plotly.restyle(plan, { x: [[marker.x[k]]], y: [[marker.y[k]]] }, [marker.trace]);
+        const k = nearest(along.time, event.points[0].x);
+        Plotly.restyle(plan, { x: [[along.x[k]]], y: [[along.y[k]]] }, [marker.trace]);
       });
     });
   }

@@ -30,12 +30,13 @@ class Card:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table: the first `left` columns are words, the others figures."""
+    """A table: the first `left` columns are words, the others figures; a click on a row with a place in `at` shows it in that figure."""
 
     columns: Sequence[str]
     rows: Sequence[Sequence[object]]
     left: int = 1
     caption: str = ""
+    at: Sequence[tuple[str, float] | None] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +52,9 @@ class Figure:
     moves : bool
         Whether hovering moves the train in the plan; the x axis must then be the time of `marker`.
     marker : dict, optional
-        Of the plan only: time, x and y of the train, and the index of the trace that shows it.
+        Of the plan only: time, x and y of the train, and the index of the trace that shows it; `places` may hold time, x and y by figure.
+    fine : dict, optional
+        Curves as measured, packed (`railnav.web.strips.stack`): shown when the figure is zoomed.
     """
 
     id: str
@@ -59,6 +62,7 @@ class Figure:
     layout: dict[str, Any]
     moves: bool = False
     marker: dict[str, Any] | None = None
+    fine: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +147,7 @@ def page(
             f'<script type="application/json" id="figures">{_json([_figure_data(f) for f in figures])}</script>',
             f"<script>{_plotly()}</script>" if figures else "",
             f"<script>{_resource('page.js')}</script>" if figures else "",
+            f"<script>{_resource('strips.js')}</script>" if any(figure.fine for figure in figures) else "",
             "</body>",
             "</html>",
             "",
@@ -184,11 +189,17 @@ def _table(table: Table) -> str:
     shown = [k for k in range(len(table.columns)) if any(str(row[k]) for row in table.rows)]
     mark = ['class="n"' if k >= table.left else "" for k in range(len(table.columns))]
     head = "".join(f"<th {mark[k]}>{escape(table.columns[k])}</th>" for k in shown)
+    places = table.at or [None] * len(table.rows)
     rows = "".join(
-        "<tr>" + "".join(f"<td {mark[k]}>{escape(str(row[k]))}</td>" for k in shown) + "</tr>" for row in table.rows
+        _row(place) + "".join(f"<td {mark[k]}>{escape(str(row[k]))}</td>" for k in shown) + "</tr>"
+        for row, place in zip(table.rows, places, strict=True)
     )
     caption = f"<caption>{escape(table.caption)}</caption>" if table.caption else ""
     return f'<div class="scroll"><table>{caption}<thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
+
+
+def _row(place: tuple[str, float] | None) -> str:
+    return "<tr>" if place is None else f'<tr class="go" data-figure="{escape(place[0])}" data-x="{place[1]:.7g}">'
 
 
 def _figure_data(figure: Figure) -> dict[str, Any]:
@@ -198,6 +209,7 @@ def _figure_data(figure: Figure) -> dict[str, Any]:
         "layout": figure.layout,
         "moves": figure.moves,
         "marker": figure.marker,
+        "fine": figure.fine,
     }
 
 

@@ -13,8 +13,9 @@ from click.testing import CliRunner
 from railnav.cli import main
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "monitoring"))
-from recorded import TRACK, line, recorded
+from recorded import TRACK, design_of, line, recorded
 
+from railnav.io.designs import write_designs
 from railnav.io.run import write_run
 
 
@@ -100,6 +101,18 @@ def test_monitor_in_json(cars, tmp_path):
     assert {e["channel"] for e in facts["sections"][0]["exceedances"]} >= {"gauge"}
 
 
+def test_versines_on_chords_are_given_or_refused(cars, tmp_path):
+    words = ["monitor", cars / "car-1", "-m", cars / "line.gpkg", "-o", tmp_path / "g.html"]
+    code, out, err = run(*words, "--json", "--chord", "20", "--chord", "4+6", "--chord", "4.1+17.4")
+    assert code == 0, err
+    part = json.loads(out)["sections"][0]["runs"][0]
+    assert {"versine_10+10m", "versine_4+6m"} <= set(part["channels"])
+    assert "no whole numbers of steps of 0.25 m" in part["refused"]["versine_4.1+17.4m"]
+    code, _, err = run(*words, "--chord", "long")
+    assert code == 2
+    assert "'long' is no chord" in err
+
+
 def test_default_limits_are_printed_and_read_back(cars, tmp_path):
     code, out, _ = run("monitor", "--default-limits")
     assert code == 0
@@ -170,6 +183,46 @@ def test_files_that_are_not_there_or_of_no_known_kind_are_one_line(cars, tmp_pat
     assert not list(tmp_path.iterdir())
 
 
+def test_two_simulated_recording_cars_see_the_same_irregular_track(cars, tmp_path):
+    """Same track seed, other sensors' seed and date: channels agree to their noise, and growth has a date to count from."""
+    import numpy as np
+
+    words = ["simulate", "-m", cars / "line.gpkg", "--grade", "geometry", "--route", "77R-02"]
+    for name, more in (("a", ["--start", "2026-01-10"]), ("b", ["--start", "2026-07-10", "--seed", 5])):
+        code, out, err = run(*words, "-o", tmp_path / name, *more, "--json")
+        assert code == 0, err
+        assert json.loads(out)["irregular"] == 1.0
+    code, out, err = run(
+        "monitor",
+        tmp_path / "a",
+        tmp_path / "b",
+        "-m",
+        cars / "line.gpkg",
+        "-o",
+        tmp_path / "g.html",
+        "--channels",
+        tmp_path / "c.csv",
+    )
+    assert code == 0, err
+    with (tmp_path / "c.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    level = {
+        name: {float(r["distance_m"]): float(r["gauge_mm"]) for r in rows if r["run"] == name and r["gauge_mm"]}
+        for name in "ab"
+    }
+    both = sorted(set(level["a"]) & set(level["b"]))
+    assert np.corrcoef([level["a"][d] for d in both], [level["b"][d] for d in both])[0, 1] > 0.97
+    for wrong, said in ((["--imu", "STIM300"], "leave --imu out"), (["--start", "soon"], "'soon' does not match")):
+        code, _, err = run(*words, "-o", tmp_path / "c", *wrong)
+        assert code == 2
+        assert said in err
+    code, out, err = run(
+        "simulate", "-m", cars / "line.gpkg", "-o", tmp_path / "d", "--route", "77R-02", "--irregular", "2", "--json"
+    )
+    assert code == 0, err
+    assert json.loads(out)["irregular"] == 2.0
+
+
 def test_contradictory_fixed_points_are_named_on_one_line(cars, tmp_path):
     fixed = tmp_path / "fixed.csv"
     fixed.write_text(
@@ -185,6 +238,90 @@ def test_contradictory_fixed_points_are_named_on_one_line(cars, tmp_path):
     assert "'bridge B' at 1005.0 m" in err
     assert "platform" not in err
     assert not (tmp_path / "plan.csv").exists()
+
+
+def test_a_design_that_misses_the_axis_by_metres_is_one_line_with_the_place(cars, tmp_path):
+    write_designs([design_of(line(), 3.5, 900.0)], tmp_path / "design.xml")
+    words = [
+        "lining",
+        cars / "car-1",
+        "-m",
+        cars / "line.gpkg",
+        "-o",
+        tmp_path / "plan.csv",
+        "--design",
+        tmp_path / "design.xml",
+    ]
+    code, _, err = run(*words)
+    assert code == 1
+    assert err.count("\n") == 1
+    assert "design 'design' misses the measured axis by 3." in err
+    assert f"on track '{TRACK}' at " in err
+    assert not (tmp_path / "plan.csv").exists()
+
+
+def test_of_several_designs_the_one_meant_is_named(cars, tmp_path):
+    from dataclasses import replace
+
+    ours, older = design_of(line(), 0.0, 700.0), replace(design_of(line(), 0.15, 700.0), track="older")
+    write_designs([ours, older], tmp_path / "designs.csv")
+    words = [
+        "lining",
+        cars / "car-1",
+        "-m",
+        cars / "line.gpkg",
+        "-o",
+        tmp_path / "plan.csv",
+        "--design",
+        tmp_path / "designs.csv",
+    ]
+    code, _, err = run(*words)
+    assert code == 1
+    assert err.count("\n") == 1
+    assert "all lie along section" in err
+    code, out, err = run(*words, "--alignment", "design", "--json")
+    assert code == 0, err
+    facts = json.loads(out)
+    assert facts["design"] == "design"
+    assert facts["versine_method"]["spread_mm"]
+    code, _, err = run(*words, "--alignment", "newer")
+    assert (code, err.count("\n")) == (1, 1)
+    assert "there is no design 'newer'; there are 'design', 'older'" in err
+
+
+def test_gauge_outliers_are_counted_and_a_broken_gauge_stream_is_not_used(cars, tmp_path):
+    from dataclasses import replace
+
+    import numpy as np
+
+    car = recorded(1)
+    wild = car.gauge.gauge.copy()
+    wild[5000:5030] = 1.9
+    write_run(replace(car, id="wild", gauge=replace(car.gauge, gauge=wild)), tmp_path / "wild")
+    code, out, err = run("monitor", tmp_path / "wild", "-m", cars / "line.gpkg", "-o", tmp_path / "g.html", "--json")
+    assert code == 0, err
+    part = json.loads(out)["sections"][0]["runs"][0]
+    assert any("gauge: 30 samples outside 1395 to 1515 mm" in note for note in part["notes"])
+    assert part["channels"]["gauge"]["judged"]
+    noise = np.random.default_rng(1).uniform(1.2, 1.9, len(wild))
+    write_run(replace(car, id="broken", gauge=replace(car.gauge, gauge=noise)), tmp_path / "broken")
+    code, out, err = run("monitor", tmp_path / "broken", "-m", cars / "line.gpkg", "-o", tmp_path / "g.html", "--json")
+    assert code == 0, err
+    part = json.loads(out)["sections"][0]["runs"][0]
+    assert "of the gauge samples lie outside" in part["refused"]["gauge"]
+    assert "of the gauge samples lie outside" in part["refused"]["alignment_left_d1"]
+    assert "alignment_d1" in part["channels"]
+
+
+def test_a_run_that_covers_a_part_of_the_section_is_said(cars, tmp_path):
+    section = ["--tracks", f"{TRACK}"]
+    code, _, err = run("monitor", cars / "car-1", "-m", cars / "line.gpkg", "-o", tmp_path / "g.html", *section)
+    assert code == 0
+    assert "covers 3000 m" in err
+    assert f"of the {line().length(TRACK):.0f} m asked for" in err
+    code, _, err = run("lining", cars / "car-1", "-m", cars / "line.gpkg", "-o", tmp_path / "p.csv", *section)
+    assert code == 0
+    assert "the runs leave gaps beyond" in err
 
 
 def test_usage_that_cannot_be_meant(cars, tmp_path):
@@ -236,3 +373,41 @@ def test_a_real_line_with_gnss_alone_is_told_what_its_accuracy_allows(shared_dat
             assert not any(channel["judged"] for channel in one["channels"].values())
             assert "GNSS positions would leave" in one["refused"]["alignment_d3"]
     assert "No channel could be held against a limit" in (tmp_path / "g.html").read_text(encoding="utf-8")
+    plan = ["lining", folder / "2022-01-08_FA-SU_ublox", "-m", tmp_path / "line.gpkg", "-o", tmp_path / "plan.csv"]
+    code, _, err = run(*plan)
+    assert code == 1
+    assert err.count("\n") == 1
+    assert "the axis is only known to" in err
+    assert "show the method on such data" in err
+    code, out, err = run(*plan, "--most-slew", 1000, "--curvature-rate", 1e-4, "--cutoff", 500, "--json")
+    assert code == 0, err
+    facts = json.loads(out)
+    assert not facts["usable"]
+    assert not any(band["borne"] for band in facts["bears"].values())
+    assert any("allows corrections in none of the bands" in note for note in facts["notes"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("which", ["sbb", "mannheim"])
+def test_a_recording_car_on_real_axes_is_monitored_and_lined(shared_data, tmp_path, which):
+    """Simulated runs on the axes of SBB (with their own design, heights and cant) and of Mannheim (without heights)."""
+    source, crs, route, name = {
+        "sbb": (shared_data / "sbb" / "zuerich-winterthur.landxml.xml", "EPSG:2056", "A50068A.1", "A50068A"),
+        "mannheim": (shared_data / "mannheim" / "mannheim_tracks.csv", "EPSG:31467", "1-S-13-200.1,1-S-13-200.8", ""),
+    }[which]
+    model, car = tmp_path / "line.gpkg", tmp_path / "car"
+    assert run("import", source, "--crs", crs, "-o", model)[0] == 0
+    code, _, err = run("simulate", "-m", model, "-o", car, "--grade", "geometry", "--route", route, "--top-speed", 60)
+    assert code == 0, err
+    code, out, err = run("monitor", car, "-m", model, "-o", tmp_path / "g.html", "--json")
+    assert code == 0, err
+    channels = json.loads(out)["sections"][0]["runs"][0]["channels"]
+    assert all(channels[key]["judged"] for key in ("gauge", "longitudinal_level_left_d1", "alignment_right_d1"))
+    more = ["--design", source, "--design-crs", crs] if name else []
+    code, out, err = run("lining", car, "-m", model, "-o", tmp_path / "plan.csv", "--json", *more)
+    assert code == 0, err
+    facts = json.loads(out)
+    assert facts["usable"]
+    assert (facts["design"] or "") == name
+    assert facts["spread_mm"]["alignment D2"][1] < 0.3 * facts["spread_mm"]["alignment D2"][0]
+    assert all(band["borne"] for band in facts["bears"].values())

@@ -11,6 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from railnav.cli import main
+from railnav.io.geopackage import read_model
 from railnav.io.run import read_run
 
 #: A few rows of every stream with its required columns alone.
@@ -192,3 +193,21 @@ def test_the_verbs_as_they_are_stated(here: Path) -> None:
     _said("view", "two.gpkg", "-o", "two.html")
     for name in ("report.html", "plan.csv", "two.html"):
         assert Path(name).stat().st_size > 500
+
+
+def test_chainage_of_a_file_becomes_line_references(here: Path) -> None:
+    """What an import keeps of posts answers addresses, there and back, also after a refinement of the tracks."""
+    facts = _said("import", "line.geojson", "-o", "m.gpkg", "--spacing", "5")
+    assert facts["lines"] == ["77", "78"]
+    places = _said("chainage", "m.gpkg", "40.345", "--line", "77")["places"]
+    assert isinstance(places, list)
+    assert {place["track"] for place in places} >= {"77R-01"}
+    _said("update", "m.gpkg", "service", "-o", "refined.gpkg", "--from-service")
+    before, after = read_model(here / "m.gpkg"), read_model(here / "refined.gpkg")
+    assert len(after.references) == len(before.references) > 0
+    for name in ("77R-01", "77R-03"):
+        ends = [
+            m.references.offset[m.references.track == m.track_id.index(name)].max() / m.length(name)
+            for m in (before, after)
+        ]
+        assert ends[0] == pytest.approx(ends[1], abs=1e-12)

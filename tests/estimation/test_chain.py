@@ -16,14 +16,16 @@ from railnav.errors import EstimationError
 from railnav.estimation import (
     Chain,
     ChainFilter,
+    ChainRecords,
     consistency,
     constant_velocity_chain,
+    fixed_lag,
     increment_chain,
     inverse_root,
     nees,
     solve_chain,
 )
-from railnav.estimation import _kernels as kernels
+from railnav.estimation import _row_kernels as kernels
 from railnav.estimation import chain as chain_module
 from railnav.estimation.oracle import banded_solution, dense_system, kalman_rts, row_reduction
 
@@ -277,6 +279,33 @@ def test_sizes_compiled_apart_agree_with_the_general_loop(monkeypatch: pytest.Mo
     np.testing.assert_allclose(special.records, general.records, rtol=0, atol=1e-13)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_three_states_with_upper_rows_are_the_general_loop(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rotations written out for n = 3: late starts, gaps, zeros within rows, links that say little, weights over eight decades."""
+    rng = np.random.default_rng(seed)
+    N = 60
+    scale = 10.0 ** rng.uniform(-4, 4, (3, N, 1, 1))
+    H, M, L = (np.triu(rng.standard_normal((N, 3, 3)) + 2 * np.eye(3)) * s for s in scale)
+    H[7, 0, 1] = M[9, 1, 1] = M[11, 0, 2] = H[13, 2, 2] = L[15, 1, 1] = 0.0
+    M[17] = -L[17]
+    M[19, 2, 2] = 0.0
+    L[21, 2] = 0.0
+    counts, links = rng.choice([0, 3, 3, 3, 2], N), np.full(N - 1, 3)
+    counts[: seed % 4] = 0
+    links[30] = 2
+    u, z = rng.standard_normal((2, N, 3))
+    chain = Chain(H, z, M[:-1], L[:-1], u[:-1], counts=counts, coupling_counts=links, prior=(np.eye(3), np.ones(3)))
+    special = solve_chain(chain, filtered=True)
+    monkeypatch.setattr(chain_module, "SPECIALISED_SIZES", ())
+    general = solve_chain(chain, filtered=True)
+    for name in ("records", "triangle", "nis", "coupling_nis", "filtered", "state"):
+        np.testing.assert_allclose(getattr(special, name), getattr(general, name), rtol=1e-8, atol=1e-9, err_msg=name)
+    for name in ("dof", "coupling_dof"):
+        np.testing.assert_array_equal(getattr(special, name), getattr(general, name), err_msg=name)
+    twin = row_reduction(chain)
+    np.testing.assert_allclose(special.state, twin.state, rtol=1e-7, atol=1e-8)
+
+
 def test_long_chain_equals_banded_normal_equations() -> None:
     rng = np.random.default_rng(3)
     N = 20_000
@@ -312,6 +341,52 @@ def test_interpreted_and_compiled_kernels_agree() -> None:
         answers.append([json.loads(line) for line in out.stdout.splitlines()])
     for compiled, interpreted in zip(*answers, strict=True):
         np.testing.assert_allclose(compiled, interpreted, atol=1e-12, rtol=1e-12)
+
+
+@pytest.mark.parametrize("n", [2, 3, 6])
+def test_without_records_the_answer_is_the_same_and_the_store_small(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(chain_module, "PAGE", 7)
+    for q in (n, n + 1):
+        chain = random_chain(n + 60, n, q=q)
+        whole = solve_chain(chain, covariance=False, filtered=True, evidence=True, gate=0.5)
+        lean = solve_chain(chain, covariance=False, filtered=True, evidence=True, gate=0.5, records=False)
+        for name in (
+            "state",
+            "nis",
+            "dof",
+            "rejected",
+            "filtered",
+            "log_evidence",
+            "coupling_nis",
+            "coupling_dof",
+            "triangle",
+        ):
+            np.testing.assert_allclose(getattr(lean, name), getattr(whole, name), rtol=0, atol=1e-11, err_msg=name)
+        assert lean.records.shape == (0, n, 2 * n + 1)
+        assert lean.redundancy == whole.redundancy
+        assert whole.rejected.any()
+    with pytest.raises(EstimationError, match="covariances need the records"):
+        solve_chain(chain, records=False)
+    with pytest.raises(EstimationError, match="without records"):
+        ChainRecords.of(lean)
+    with pytest.raises(EstimationError, match="without records"):
+        fixed_lag(lean, 3)
+    alone = Chain(chain.H, chain.z, chain.M[:, :n], chain.L[:, :n], chain.u[:, :n], counts=np.zeros(len(chain), int))
+    with pytest.raises(EstimationError, match="epoch 39: component"):
+        solve_chain(alone, covariance=False, records=False)
+
+
+def test_links_of_n_rows_may_leave_residuals_too() -> None:
+    """A link row that holds only the state before is redundant: room for residuals of links is made when they are met."""
+    chain = random_chain(77, 3)
+    L = chain.L.copy()
+    L[20, 0] = 0.0
+    odd = Chain(chain.H, chain.z, chain.M, L, chain.u, counts=chain.counts, prior=chain.prior)
+    solution = solve_chain(odd)
+    assert list(np.flatnonzero(solution.coupling_dof)) == [20]
+    assert solution.coupling_dof[20] == 1
+    assert solution.sum_of_squares == pytest.approx(dense(odd)[2], rel=1e-10)
+    agree(odd, 1e-8)
 
 
 # ---------------------------------------------------------------- live

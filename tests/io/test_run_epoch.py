@@ -98,3 +98,29 @@ def test_written_runs_read_back(tmp_path):
 def test_refusals(tmp_path, lines, words):
     with pytest.raises(RunError, match=words):
         read_run(write(tmp_path / "a", lines))
+
+
+def test_a_model_keeps_its_datum_and_takes_runs_of_no_other():
+    from dataclasses import replace
+
+    from railnav.simulation import SURVEY, Leg, demo_line, simulate
+
+    line, leg = demo_line(spacing=10.0), Leg(("77R-03",), start=0.0, finish=1200.0)
+    outfit = replace(SURVEY, angles=None, gauge=None)
+    runs = [simulate(line, leg, seed=k, outfit=outfit, run_id=f"s{k}", direction="up")[0] for k in range(3)]
+
+    def fixed(run, datum):
+        return replace(run, gnss=replace(run.gnss, fixed_to=datum))
+
+    model = railnav.build([fixed(run, "ETRS89") for run in runs[:2]], spacing=5.0)
+    assert model.provenance["fixed_to"] == "ETRS89"
+    assert not any("fixed" in text for text in model.provenance["build"]["warnings"])
+    for datum, words in (
+        ("", "is fixed to no datum, the model to ETRS89"),
+        ("GSK-2011", "is fixed to GSK-2011, the model to ETRS89"),
+    ):
+        with pytest.raises(RunError, match=words):
+            railnav.update(model, [fixed(runs[2], datum)])
+    assert railnav.update(model, [fixed(runs[2], "ETRS89")]).provenance["fixed_to"] == "ETRS89"
+    mixed = railnav.build([fixed(runs[0], "ETRS89"), runs[1]], spacing=5.0)
+    assert any("fixed to ETRS89, but s1 is not" in text for text in mixed.provenance["build"]["warnings"])

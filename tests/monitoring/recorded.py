@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cache
 
+from railnav.monitoring.design import Design, design_of_elements
 from railnav.navigation import navigate
 from railnav.run import Run
 from railnav.simulation import Leg, demo_line
@@ -58,3 +60,19 @@ def recorded(seed: int, *, month: int = 1, growing: float = 0.0, backwards: bool
 @cache
 def solved(seed: int, **options):
     return navigate(recorded(seed, **options), line(), smooth=True)
+
+
+def design_of(model: TrackModel, shift: float = 0.0, length: float = 1000.0) -> Design:
+    """A design that starts as the track does, straight, and a shift to its right."""
+    point = model.at(TRACK, 0.0)
+    bearing = float(point.grid_bearing)
+    return design_of_elements(
+        "design",
+        ["straight"],
+        [length],
+        [0.0],
+        easting=float(point.easting) + shift * math.cos(bearing),
+        northing=float(point.northing) - shift * math.sin(bearing),
+        grid_bearing=bearing,
+        crs=model.frame.crs_wkt,
+    )

@@ -7,18 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from recorded import TRACK, fields, line, recorded, solved
+from recorded import TRACK, design_of, fields, line, recorded, solved
 
 from railnav.errors import InputError, TrackError
 from railnav.io.lining import read_fixed_points, write_plan
-from railnav.monitoring.design import design_of_elements
 from railnav.monitoring.filters import D1, D2, D3_ALIGNMENT, band_pass
 from railnav.monitoring.lining import LiningLimits, line_up
-from railnav.monitoring.position import MeasuredAxis, measured_axis
+from railnav.monitoring.position import MeasuredAxis, band_sigma, measured_axis
 from railnav.monitoring.recording import record
 from railnav.monitoring.section import onto, passages_of, section_of
 from railnav.monitoring.smoothing import Bounds, FixedPoint, InfeasibleError, corrections, feasible, whittaker
-from railnav.track.model import TrackModel
 
 
 def section():
@@ -192,22 +190,6 @@ def test_a_single_impossible_fixed_point_and_impossible_limits_are_said():
 # --- plans ------------------------------------------------------------------------------------------------------------
 
 
-def design_of(model: TrackModel, shift: float = 0.0, length: float = 1000.0):
-    """A design that starts as the track does, straight, and a shift to its right."""
-    point = model.at(TRACK, 0.0)
-    bearing = float(point.grid_bearing)
-    return design_of_elements(
-        "design",
-        ["straight"],
-        [length],
-        [0.0],
-        easting=float(point.easting) + shift * math.cos(bearing),
-        northing=float(point.northing) - shift * math.sin(bearing),
-        grid_bearing=bearing,
-        crs=model.frame.crs_wkt,
-    )
-
-
 def straight_length() -> float:
     """How far the track runs straight from its start, m."""
     d = np.arange(0.0, 2000.0, 5.0)
@@ -248,6 +230,128 @@ def test_a_design_that_misses_the_axis_is_refused_with_the_place():
     # of two designs the one of this track is taken
     plan = line_up(axis(np.zeros(300)), designs=[design_of(line(), 4.0, 300.0), design_of(line(), 0.01, 300.0)])
     assert np.abs(plan.right_before + 0.01).max() < 1e-3
+
+
+def test_the_design_of_the_track_is_chosen_by_place_or_name_and_a_doubt_is_refused():
+    ours, other = design_of(line(), 0.01, 300.0), replace(design_of(line(), 0.20, 300.0), track="older")
+    flat = axis(np.zeros(500))
+    with pytest.raises(
+        TrackError,
+        match=r"designs 'design' \(0\.010 m off\), 'older' \(0\.200 m off\) all lie along section .*: name the one",
+    ):
+        line_up(flat, designs=[other, ours])
+    plan = line_up(flat, designs=[ours, other], alignment="older")
+    assert plan.design == "older"
+    assert np.median(plan.right_before) == pytest.approx(-0.20, abs=1e-3)
+    with pytest.raises(TrackError, match="there is no design 'x'; there are 'design', 'older'"):
+        line_up(flat, designs=[ours, other], alignment="x")
+    # the track's own name decides, as does the same line drawn twice
+    named = line_up(flat, designs=[ours, replace(other, track=TRACK)])
+    assert named.design == TRACK
+    assert any("'design' also lie along" in note for note in named.notes)
+    assert line_up(flat, designs=[ours, replace(ours, track="copy")]).design == "design"
+    # a short piece that touches the track at its end is no rival
+    assert line_up(flat, designs=[ours, replace(design_of(line(), 0.30, 110.0), track="turnout")]).design == "design"
+
+
+def test_of_designs_that_all_miss_the_axis_the_nearest_is_named():
+    away = [replace(design_of(line(), shift, 300.0), track=f"{shift:g} m off") for shift in (12.0, 4.0, 8.0)]
+    with pytest.raises(
+        TrackError, match=rf"design '4 m off' misses the measured axis by 4\.0\d m on track '{TRACK}' at \d+ m"
+    ):
+        line_up(axis(np.zeros(500)), designs=away)
+    far = replace(design_of(line(), 0.0, 300.0), track="elsewhere")
+    far = replace(far, plan=replace(far.plan, easting=far.plan.easting + 5e4))
+    with pytest.raises(TrackError, match=r"its nearest point is [45]\d,\d{3}\.\d\d m from the axis"):
+        line_up(axis(np.zeros(500)), designs=[far])
+
+
+def test_the_work_fades_in_and_out_at_its_ends():
+    y = np.full(1200, 0.04)
+    y[:20] += 0.01
+    for ramp in (1e-3, 5e-4):
+        plan = line_up(axis(y), designs=[design_of(line(), 0.0, 640.0)], limits=LiningLimits(ramp=ramp))
+        end = np.minimum(plan.distance - plan.distance[0], plan.distance[-1] - plan.distance)
+        assert (np.abs(plan.slew) <= ramp * end + 1e-9).all()
+        assert np.abs(plan.slew).max() == pytest.approx(0.04, abs=2e-3)
+    # a least lift above zero begins and ends at zero as well
+    limits = LiningLimits(least_lift=0.02)
+    plan = line_up(axis(np.zeros(1200), np.zeros(1200)), limits=limits)
+    assert plan.lift[[0, -1]] == pytest.approx([0.0, 0.0], abs=1e-9)
+    assert plan.lift[(plan.distance > 60.0) & (plan.distance < plan.distance[-1] - 60.0)].min() >= 0.02 - 1e-9
+
+
+def test_sigmas_of_slews_and_lifts_cover_what_the_axis_errors_make_of_them():
+    """Plans of measured axes against the plan of the simulated track itself, over seeds and both directions."""
+    right, up = [], []
+    for seed in (1, 2, 3):
+        made = measured_axis(section(), [recording(seed)])
+        which, offset = made.section.locate(made.distance)
+        truth = fields().at(which, offset)
+        exact = replace(
+            made,
+            right=np.where(np.isfinite(made.right), truth[:, 0], np.nan),
+            up=np.where(np.isfinite(made.up), truth[:, 1], np.nan),
+        )
+        plan, ideal = line_up(made), line_up(exact)
+        right.append(np.mean(((plan.slew - ideal.slew) / plan.sigma_slew) ** 2))
+        up.append(np.mean(((plan.lift - ideal.lift) / plan.sigma_lift) ** 2))
+        assert (plan.sigma_slew < 0.01 * made.sigma_right).all()  # what axis and target share drops out
+    assert 0.6 < np.sqrt(np.mean(right)) < 1.3
+    assert 0.4 < np.sqrt(np.mean(up)) < 1.3
+
+
+def test_sigmas_follow_the_number_of_runs_and_the_kind_of_target():
+    local = np.where(np.arange(1000) < 500, 0.005, 0.01)
+    made = replace(axis(np.zeros(1000)), local_right=local, sigma_right=0.005)
+    smooth, design = line_up(made), line_up(made, designs=[design_of(line(), 0.0, 520.0)])
+    assert design.sigma_slew[[5, -5]] == pytest.approx([0.005, 0.01])
+    assert smooth.sigma_slew[[5, -5]] == pytest.approx([1e-4, 2e-4])
+
+
+def test_the_plan_says_which_bands_the_accuracy_of_the_axis_allows():
+    made = measured_axis(section(), [recording(1)])
+    fine = line_up(made)
+    assert all(good and sigma < 1e-3 for sigma, good in fine.bears.values())
+    assert not [note for note in fine.notes if "accuracy of the axis" in note]
+    coarse = tuple(replace(noise, angle=200.0 * noise.angle) for noise in made.noise_right)
+    plan = line_up(replace(made, noise_right=coarse))
+    assert not plan.bears["alignment", "D3"][1]
+    assert plan.bears["longitudinal_level", "D1"][1]
+    assert any("allows corrections in" in note and "in alignment" in note for note in plan.notes)
+    model = line_up(replace(made, noise_right=(), noise_up=()))
+    assert not any(good for _, good in model.bears.values())
+    assert any("in none of the bands up to 200 m" in note for note in model.notes)
+
+
+def test_the_axis_is_as_noisy_in_each_band_as_it_says():
+    """Errors of the measured shape against the simulated one, band by band, over runs; the stated sigma counts the roughness of the
+    track within three samples as noise, so it may be larger, and is never half."""
+    for band in (D1, D2, D3_ALIGNMENT):
+        ratio = []
+        for seed in (1, 2, 3):
+            made = measured_axis(section(), [recording(seed)])
+            which, offset = made.section.locate(made.distance)
+            error = band_pass(made.right - fields().at(which, offset)[:, 0], made.step, band)
+            ratio.append(np.nanstd(error) / band_sigma(made.noise_right, band))
+        assert 0.3 < np.mean(ratio) < 1.6, f"{band.name}: {ratio}"
+
+
+def test_fixed_points_off_the_stretch_are_said():
+    points = [FixedPoint("bridge", 900.0, 910.0), FixedPoint("platform", 100.0, 100.0, 0.0, 0.01)]
+    plan = line_up(axis(np.zeros(800)), fixed_slew=points)
+    assert [note for note in plan.notes if "fixed point" in note] == [
+        "fixed point 'bridge' (slew) at 900 m lies outside the stretch lined, -2 to 398 m: not used"
+    ]
+
+
+def test_the_versine_method_is_held_beside_the_programme():
+    rng = np.random.default_rng(8)
+    y = 0.004 * np.convolve(rng.standard_normal(2000), np.ones(30) / 6.0, mode="same")
+    plan = line_up(axis(y))
+    strings, programme = plan.hallade_spread["alignment", "D2"], plan.spread["alignment", "D2"]
+    assert strings[1] < 0.7 * strings[0]
+    assert programme[1] < strings[1]  # both take waves out; the programme keeps its limits and does it better
 
 
 def test_a_smoothed_target_takes_short_waves_out_and_leaves_long_ones():
@@ -338,6 +442,30 @@ def test_a_plan_is_written_and_fixed_points_are_read(tmp_path):
     file.write_text("track,offset_m\nnowhere,5\n", encoding="utf-8")
     with pytest.raises(InputError, match="row 2, column track"):
         read_fixed_points(file, section())
+
+
+def test_kilometres_that_jump_back_keep_their_places_apart(tmp_path):
+    """A station equation at 200 m sends the kilometres back by 300 m: one chainage, two places, told apart by track and offset."""
+    import csv
+
+    from railnav.track.model import MilePosts
+    from railnav.web.strips import axis_of
+
+    which = line().track_index(TRACK)
+    posts = MilePosts(
+        np.full(4, which), np.array([0.0, 200.0, 200.001, 400.0]), np.array([50_000.0, 50_200.0, 49_900.0, 50_099.999])
+    )
+    made = axis(np.zeros(800), np.zeros(800))
+    made = replace(made, section=section_of(replace(line(), mileposts=posts), [TRACK]))
+    plan = line_up(made)
+    write_plan(plan, tmp_path / "plan.csv")
+    with (tmp_path / "plan.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    km = {float(row["offset_m"]): float(row["chainage_km"]) for row in rows}
+    assert km[100.0] == pytest.approx(50.1)
+    assert km[400.0 - 5.0] == pytest.approx(50.095, abs=1e-5)
+    assert [float(row["distance_m"]) for row in rows] == sorted(float(row["distance_m"]) for row in rows)
+    assert axis_of(plan.section, plan.distance)[1].startswith("km along")  # a chart along falling kilometres would fold
 
 
 def test_the_lined_axis_is_a_model_where_the_plan_moves_the_track():

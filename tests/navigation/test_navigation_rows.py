@@ -29,8 +29,13 @@ def do_inertial(fil, net, shared, bank, work, h, row, dt):
 
 
 @njit
-def do_speed(fil, bank, work, h, row):
-    equations.speed_rows(fil, bank, work, h, row)
+def do_speed(fil, shared, bank, work, h, row):
+    equations.speed_rows(fil, shared, bank, work, h, row)
+
+
+@njit
+def do_course(fil, shared, bank, work, h, row):
+    equations.course_row(fil, shared, bank, work, h, row, 1.0, 0.1)
 
 
 @njit
@@ -139,7 +144,7 @@ def test_rows_of_a_fix(engine):
     rows = engine.work.rows[h, :2].copy()
     for axis in (0, 1):
         numeric = differences(engine, lambda axis=axis: predicted(axis))
-        assert rows[axis] == pytest.approx(numeric, abs=3e-3)  # cant and gradient change by little a metre
+        assert rows[axis] == pytest.approx(numeric, abs=2e-5)
     assert np.abs(rows[:, engine.filter.at[State.MAP_CROSS]]).max() > 1.0
 
 
@@ -192,11 +197,52 @@ def test_row_of_the_speed_of_the_receiver(engine):
         share = Settings().speed_error_share * 0.1
         return x[at[State.SPEED]] - x[at[State.SPEED_LATENCY]] * a + share * x[at[State.SPEED_ERROR]]
 
-    applied = row_of(engine, lambda: do_speed(engine.filter, engine.bank, engine.work, h, row))
+    applied = row_of(engine, lambda: do_speed(engine.filter, engine.shared, engine.bank, engine.work, h, row))
     numeric = differences(engine, predicted)
     numeric[at[State.ACCELEROMETER_BIAS]] = 0.0  # latency times a bias: left out, of second order
     cosine = applied @ numeric / np.linalg.norm(applied) / np.linalg.norm(numeric)
     assert cosine == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(("lever", "near"), [(0.0, 1e-6), (2.0, 1e-5)], ids=["axis", "antenna ahead"])
+def test_row_of_the_course(engine, lever, near):
+    """Velocity across the path: the row against differences of the whole geometry, at the place that the time stamp says.
+
+    The change of the curvature over a lever arm ahead is left out.
+    """
+    h, at = engine.living()[0], engine.filter.at
+    engine.filter.lever[:] = lever, 0.4, -3.8
+    engine.bank.x[h, at[State.TIME_TAG]] = 0.0
+    place(engine)
+    row = empty()
+    point = engine.work.point[h]
+    bearing = math.atan2(point[paths.P_D_EAST], point[paths.P_D_NORTH]) + 2e-4
+    row[[c.TIME, c.SIGMA_SPEED, c.GNSS_SPEED, c.FORCE]] = 0.0, 0.1, 22.0, 0.4
+    row[[c.COURSE_EAST, c.COURSE_NORTH]] = math.sin(bearing), math.cos(bearing)
+
+    def predicted():
+        x = engine.bank.x[h]
+        there = np.empty(paths.POINT_SIZE)
+        paths.track_point(
+            engine.network, 0, 1, x[at[State.POSITION]] + x[at[State.SPEED]] * x[at[State.TIME_TAG]], there
+        )
+        east, north = there[[paths.P_D_EAST, paths.P_D_NORTH]] / np.hypot(*there[[paths.P_D_EAST, paths.P_D_NORTH]])
+        across = 22.0 * (math.sin(bearing) * north - math.cos(bearing) * east)
+        return 22.0 * there[paths.P_CURVATURE] * lever - across
+
+    def update():
+        engine.work.vector[c.W_H] = 0.0
+        do_course(engine.filter, engine.shared, engine.bank, engine.work, h, row)
+
+    applied = row_of(engine, update)
+    numeric = differences(engine, predicted, step=1e-3)
+    numeric[at[State.SPEED]] = 0.0  # speed times a stamp's error times bend: of second order
+    cosine = applied @ numeric / np.linalg.norm(applied) / np.linalg.norm(numeric)
+    assert cosine == pytest.approx(1.0, abs=1e-6)
+    i_s = at[State.POSITION]
+    kernel_row = applied[at[State.TIME_TAG]] / applied[i_s]
+    assert kernel_row == pytest.approx(engine.bank.x[h, at[State.SPEED]], rel=1e-5)
+    assert point[paths.P_CURVATURE] == pytest.approx(numeric[i_s] / 22.0, abs=near)
 
 
 def test_row_of_the_wheel(engine):

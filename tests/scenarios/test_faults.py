@@ -15,7 +15,6 @@ from railnav.simulation.faults import Fault
 #: Faults that the navigator does not master yet; `docs/accuracy.md` says so.
 NOT_YET = {
     "gnss-ramp-along-0.1",
-    "gnss-ramp-along-0.5",
     "gnss-sigma-third",
     "gnss-frame-9m-south",
     "odometer-dead",

@@ -10,7 +10,7 @@ from survey_simulator import SURVEY, axis_error, centre_line, changed, double_li
 from railnav.errors import CrsError, ModelError, RunError
 from railnav.survey import build, difference, update
 from railnav.survey.axis import Chain, ErrorModel, solve, sweep
-from railnav.survey.refining import stored_links
+from railnav.survey.sides import stored_links
 from railnav.survey.stored import keep_axis, mean_of
 from railnav.track import TrackModel
 from railnav.track.records import AxisRecords

@@ -35,9 +35,17 @@ from railnav.navigation.columns import (
     SILENT_NOISE,
     SPEED,
     SPEED_ERROR,
+    SPEED_LATENCY,
+    TAG_MEMORY,
     TIME_TAG,
     WHEEL_DISTANCE,
 )
+
+
+@part
+def timed(fil):
+    """Whether a wheel or an accelerometer tells when fixes were taken: positions and their own speeds fit any shift of their stamps."""
+    return fil.at[ACCELERATION] < 0 or fil.at[ODOMETER_SCALE] >= 0
 
 
 @part
@@ -76,6 +84,11 @@ def transition(fil, x, dt, sign, force, rough, pull, slip, shake, step, tag, tra
         fade = math.exp(-dt / k[K_SPEED_TIME])
         F[i_e, i_e] = fade
         new[i_e] = fade * x[i_e]
+    i_t = at[TIME_TAG]
+    if not timed(fil):  # nothing but the fixes tells the time: what the stamps jumped by is forgotten
+        back = math.exp(-dt / TAG_MEMORY)
+        F[i_t, i_t] = back
+        new[i_t] = back * x[i_t]
     v = x[i_v]
     F[i_s, i_v] = dt
     i_a = at[ACCELERATION]
@@ -130,8 +143,8 @@ def transition(fil, x, dt, sign, force, rough, pull, slip, shake, step, tag, tra
         c += 1
     for j in range(n):
         Q[c, j] = 0.0
-    Q[c, at[TIME_TAG]] = math.sqrt(k[K_TAG_WALK] ** 2 * dt + tag)
-    lead[c] = at[TIME_TAG]
+    Q[c, i_t] = math.sqrt(k[K_TAG_WALK] ** 2 * dt + tag)
+    lead[c] = i_t
     c += 1
     if i_e >= 0:
         for j in range(n):
@@ -299,6 +312,32 @@ def robust_row(x, P_sqrt, h, innovation, variance, f, keep, move):
         variance += innovation * innovation / ROW_GATE - s
     absorb(x, P_sqrt, f, innovation, variance, keep, move)
     return evidence
+
+
+@part
+def stamps(fil, x, P_sqrt):  # -> shift of the stamps, its variance, age of the speed, its variance
+    """What rows must not tell where nothing but the fixes tells the time."""
+    i_t, i_l = fil.at[TIME_TAG], fil.at[SPEED_LATENCY]
+    if i_l < 0:
+        return x[i_t], variance_of(P_sqrt, i_t), 0.0, 0.0
+    return x[i_t], variance_of(P_sqrt, i_t), x[i_l], variance_of(P_sqrt, i_l)
+
+
+@part
+def take_back(fil, x, P_sqrt, before, column):  # before: from `stamps`; (n,) scratch
+    """Take back what rows have told of stamps and latency, and keep what they told of the rest (consider states, Schmidt).
+
+    With gain K, P+ = P - K S K^T; a state that is only considered has no gain of its own: its covariances with the others shrink as they
+    would, its variance does not. That is the optimal update with K_i^2 S added to P_ii, and x_i as before. Estimated, both follow the
+    noise of the very speeds and accelerations that they are multiplied by.
+    """
+    for m in range(2):
+        i = fil.at[TIME_TAG] if m == 0 else fil.at[SPEED_LATENCY]
+        if i >= 0:
+            lost = before[2 * m + 1] - variance_of(P_sqrt, i)
+            x[i] = before[2 * m]
+            if lost > 0.0:
+                widen(P_sqrt, i, math.sqrt(lost), column)
 
 
 @part

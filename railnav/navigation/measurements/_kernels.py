@@ -29,6 +29,7 @@ from railnav.matching._kernels import (
     P_GRADIENT,
     P_GRADIENT_RATE,
     P_NORTH,
+    P_SIGMA_BEND,
     P_SIGMA_CROSS,
     PASSED,
     POINT_SIZE,
@@ -41,14 +42,18 @@ from railnav.matching._kernels import (
 from railnav.navigation.columns import (
     ACCELERATION,
     ACCELEROMETER_BIAS,
+    AGAINST,
     BALISE_OFFSET,
     BALISE_REACH,
     BALISE_TRACK,
+    BEARING_LENGTH,
     BEND_CHANGE,
     BLIND_LENGTH,
     C_ACCELEROMETER_FAULTS,
     C_BLAMED,
+    C_BLAMED_WAY,
     C_DISTRUST,
+    C_FIX_TIME,
     C_GNSS_SPEED,
     C_GNSS_SPEED_TIME,
     C_ODOMETER_FAULTS,
@@ -84,7 +89,6 @@ from railnav.navigation.columns import (
     K_CURVATURE_DOUBT,
     K_CURVATURE_LENGTH,
     K_CURVATURE_SHIFT,
-    K_CURVATURE_SIGMA,
     K_GRAVITY,
     K_GYRO_FLOOR,
     K_GYRO_SCALE,
@@ -107,6 +111,7 @@ from railnav.navigation.columns import (
     RING,
     ROW_GATE,
     S_COURSE,
+    S_STRETCH,
     S_YAW,
     SCALE_STEP,
     SHAKE_SPEED,
@@ -119,6 +124,7 @@ from railnav.navigation.columns import (
     SIGMA_SPEED,
     SIGMA_WHEEL,
     SIGMA_YAW,
+    SLOPES,
     SPEED,
     SPEED_ERROR,
     SPEED_LATENCY,
@@ -135,7 +141,16 @@ from railnav.navigation.columns import (
     WHEEL_SPEED,
     YAW_RATE,
 )
-from railnav.navigation.dynamics._kernels import absorb, project, robust_row, variance_of, widen
+from railnav.navigation.dynamics._kernels import (
+    absorb,
+    project,
+    robust_row,
+    stamps,
+    take_back,
+    timed,
+    variance_of,
+    widen,
+)
 from railnav.units import RAIL_CENTRE_DISTANCE
 
 
@@ -178,12 +193,15 @@ def antenna(point, lever, out):  # (POINT_SIZE,), (3,) -> out (4,): easting, nor
     cos_phi = math.sqrt(1.0 - sin_phi * sin_phi)
     right = lever[1] * cos_phi - lever[2] * sin_phi
     forward = lever[0] + lever[2] * point[P_GRADIENT]  # a mast leans back uphill
+    leaning = -(lever[1] * sin_phi / cos_phi + lever[2]) * point[P_CANT_RATE] / RAIL_CENTRE_DISTANCE
+    tipping = lever[2] * point[P_GRADIENT_RATE]
     out[0] = point[P_EAST] + forward * te + right * tn
     out[1] = point[P_NORTH] + forward * tn - right * te
     bend = point[P_CURVATURE]
-    along = 1.0 - right * bend
-    out[2] = along * te + forward * bend * tn
-    out[3] = along * tn - forward * bend * te
+    along = 1.0 - right * bend + tipping
+    aside = forward * bend + leaning
+    out[2] = along * te + aside * tn
+    out[3] = along * tn - aside * te
 
 
 @part
@@ -222,7 +240,7 @@ def second_opinion(shared, time, speed):
 def against_speed(shared, time, wheel, speed):
     """Whether wheel and receiver agree with each other and not with the filter's speed."""
     told = shared.common[C_GNSS_SPEED]
-    return second_opinion(shared, time, abs(wheel)) and abs(told - abs(speed)) > 0.7 + 2.0 * abs(told - abs(wheel))
+    return second_opinion(shared, time, abs(wheel)) and abs(told - abs(speed)) > AGAINST + 2.0 * abs(told - abs(wheel))
 
 
 @part
@@ -268,6 +286,7 @@ def wheel_row(fil, shared, bank, work, h, row, leader):
         begins = abs(innovation) > k[K_SLIP_GATE] * math.sqrt(s) or differs
     elif at[ACCELEROMETER_BIAS] >= 0 and span > 0.0 and against_speed(shared, time, wheel, x[i_v]):
         begins = False  # wheel and receiver agree: it is the accelerometer that is wrong
+        shared.common[C_BLAMED_WAY] = abs(wheel - abs(x[i_v])) * (time - info[SLIP_SINCE])
         info[SLIP_SINCE] = -np.inf
         info[AGREE_SINCE] = np.inf
         shared.common[C_ACCELEROMETER_FAULTS] += 1.0
@@ -308,6 +327,8 @@ def wheel_row(fil, shared, bank, work, h, row, leader):
         shake = (0.1 + abs(wheel - abs(x[i_v]))) ** 2
         widen(P_sqrt, i_v, math.sqrt(shake), column)
         widen(P_sqrt, at[ACCELEROMETER_BIAS], FORCE_STEP, column)
+        widen(P_sqrt, at[POSITION], shared.common[C_BLAMED_WAY], column)
+        work.slot[h, S_STRETCH] += shared.common[C_BLAMED_WAY] ** 2
     if shared.common[C_RESCALED] == time:
         widen(P_sqrt, at[ODOMETER_SCALE], SCALE_STEP, column)
     slip = 0.0
@@ -339,6 +360,15 @@ def wheel_speed_row(fil, bank, work, h, row):
     h_row[i_k] = 0.0
     h_row[i_v] = 0.0
     return evidence
+
+
+@part
+def log_once(variance, shared_part, alike):
+    """Log-determinant's share of a row whose variance holds a part that `alike` rows have in common: it counts once in them.
+
+    Without it, the hypothesis whose model states the smaller error would gain with every row.
+    """
+    return math.log(variance - shared_part) + math.log(variance / (variance - shared_part)) / alike
 
 
 @part
@@ -388,9 +418,12 @@ def inertial_rows(fil, net, shared, bank, work, h, row, dt):
     lean_rest = again * max(lean_square - lean * lean - lean_slope * lean_slope, 0.0)
     slope /= sd
     lean_slope /= sd
+    if fil.slope > 0.0 and slope != 0.0:  # what the errors of a built model slope by is no landmark (garrote of slopes)
+        part_of = SLOPES * fil.slope / slope
+        slope *= max(0.0, 1.0 - part_of * part_of)
     # errors of the model's curvature are the same over some length: count them once a length, not once a row
     alike = max(1.0, k[K_CURVATURE_LENGTH] / max(abs(v) * dt, 0.1))
-    rough = (k[K_CURVATURE_SIGMA] ** 2 + (slope * k[K_CURVATURE_SHIFT]) ** 2) * alike
+    rough = (probe[P_SIGMA_BEND] ** 2 + (slope * k[K_CURVATURE_SHIFT]) ** 2) * alike
     # where the model does not know where the track lies (a bridged tunnel) it does not know how it bends either
     poor = probe[P_SIGMA_CROSS] / (BLIND_LENGTH * BLIND_LENGTH)
     rough += poor * poor * max(1.0, BLIND_LENGTH / max(abs(v) * dt, 0.1))
@@ -408,12 +441,13 @@ def inertial_rows(fil, net, shared, bank, work, h, row, dt):
         innovation = row[YAW_RATE] - v * (mean + x[i_t] * roll) - x[i_g]
         # tracks side by side differ in curvature by less than a model is wrong: only a turnout's difference is evidence
         doubt = project(P_sqrt, h_row, f) + variance + (v * k[K_CURVATURE_DOUBT]) ** 2
-        credit(bank, h, BY_YAW, -0.5 * counts * (min(innovation * innovation / doubt, ROW_GATE) + math.log(doubt)))
+        said = min(innovation * innovation / doubt, ROW_GATE) + log_once(doubt, v * v * rough, alike)
+        credit(bank, h, BY_YAW, -0.5 * counts * said)
         work.slot[h, S_YAW] = innovation * innovation / (doubt - (v * k[K_CURVATURE_DOUBT]) ** 2)
         robust_row(x, P_sqrt, h_row, innovation, variance, f, keep, move)
         h_row[i_g] = 0.0
         h_row[i_t] = 0.0
-    if row[SIDE] == row[SIDE]:
+    if row[SIDE] == row[SIDE] and fil.canted == 1:
         v = x[i_v]
         said = v * v * mean - k[K_GRAVITY] * lean
         sway = k[K_SIDE_NOISE] * min(1.0, 0.1 + abs(v) / 5.0)
@@ -426,7 +460,8 @@ def inertial_rows(fil, net, shared, bank, work, h, row, dt):
         h_row[i_y] = 1.0
         innovation = row[SIDE] - said - x[i_y]
         doubt = project(P_sqrt, h_row, f) + variance + (v * v * k[K_CURVATURE_DOUBT]) ** 2
-        credit(bank, h, BY_SIDE, -0.5 * counts * (min(innovation * innovation / doubt, ROW_GATE) + math.log(doubt)))
+        said = min(innovation * innovation / doubt, ROW_GATE) + log_once(doubt, v**4 * rough, alike)
+        credit(bank, h, BY_SIDE, -0.5 * counts * said)
         robust_row(x, P_sqrt, h_row, innovation, variance, f, keep, move)
         h_row[i_y] = 0.0
     h_row[i_s] = 0.0
@@ -494,14 +529,52 @@ def missed_balises(fil, net, bank, h):
 
 
 @part
-def speed_rows(fil, bank, work, h, row):
+def course_row(fil, shared, bank, work, h, row, sign, sigma):
+    """GNSS course as the velocity across the path where the antenna moves there; `sign` says which way the train runs along it."""
+    at = fil.at
+    k = fil.settings
+    x, P_sqrt = bank.x[h], bank.P_sqrt[h]
+    h_row, f, keep, move = work.vector[W_H], work.vector[W_F], work.vector[W_KEEP], work.vector[W_MOVE]
+    point = work.point[h]
+    i_s, i_v, i_t = at[POSITION], at[SPEED], at[TIME_TAG]
+    speed, course_east, course_north = row[GNSS_SPEED], row[COURSE_EAST], row[COURSE_NORTH]
+    stated = row[SIGMA_SPEED] > 0.0
+    bend = point[P_CURVATURE]
+    step = x[i_s] + x[i_v] * x[i_t] - point[POINT_SIZE]  # the course is of where the fix shows the train
+    te = point[P_D_EAST] + step * bend * point[P_D_NORTH]
+    tn = point[P_D_NORTH] - step * bend * point[P_D_EAST]
+    across = sign * speed * (course_east * tn - course_north * te) / math.hypot(te, tn)
+    across -= sign * speed * bend * fil.lever[0]
+    floor = speed * k[K_COURSE_SIGMA] * (0.2 if stated else 3.0)
+    bent = 0.5 * speed * BEND_CHANGE * variance_of(P_sqrt, i_s)
+    h_row[i_s] = sign * speed * bend
+    h_row[i_t] = h_row[i_s] * x[i_v]
+    # an error of the model's bearing is the same from fix to fix of a slow train
+    turned = speed * fil.turned * point[P_SIGMA_CROSS]
+    alike = max(1.0, BEARING_LENGTH / max(speed * (row[TIME] - shared.common[C_FIX_TIME]), 0.1))
+    variance = sigma * sigma + floor * floor + bent * bent + alike * turned * turned
+    # tracks side by side differ in bearing by less than a model is wrong: only a turnout's leg is evidence
+    doubt = k[K_COURSE_DOUBT] + fil.turned * point[P_SIGMA_CROSS]
+    doubt = project(P_sqrt, h_row, f) + variance + (speed * doubt) ** 2
+    said = min(across * across / doubt, ROW_GATE) + log_once(doubt, alike * turned * turned, alike)
+    work.slot[h, S_COURSE] -= 0.5 * said
+    before = stamps(fil, x, P_sqrt)
+    robust_row(x, P_sqrt, h_row, across, variance, f, keep, move)
+    if not timed(fil):
+        take_back(fil, x, P_sqrt, before, work.vector[W_COLUMN])
+    h_row[i_t] = 0.0
+    h_row[i_s] = 0.0
+
+
+@part
+def speed_rows(fil, shared, bank, work, h, row):
     """GNSS speed, |v - latency a| + error, and course, the velocity across the path as the antenna moves there."""
     at = fil.at
     k = fil.settings
     x, P_sqrt = bank.x[h], bank.P_sqrt[h]
     h_row, f, keep, move = work.vector[W_H], work.vector[W_F], work.vector[W_KEEP], work.vector[W_MOVE]
     point = work.point[h]
-    i_v, i_s, i_l, i_e, i_a = at[SPEED], at[POSITION], at[SPEED_LATENCY], at[SPEED_ERROR], at[ACCELERATION]
+    i_v, i_l, i_e, i_a = at[SPEED], at[SPEED_LATENCY], at[SPEED_ERROR], at[ACCELERATION]
     speed = row[GNSS_SPEED]
     course_east, course_north = row[COURSE_EAST], row[COURSE_NORTH]
     stated = row[SIGMA_SPEED] > 0.0
@@ -509,7 +582,10 @@ def speed_rows(fil, bank, work, h, row):
     v = x[i_v]
     if speed < 4.0 * sigma and abs(v) < 8.0 * sigma:  # near standstill the sign is not told
         h_row[i_v] = 1.0
+        before = stamps(fil, x, P_sqrt)
         credit(bank, h, BY_SPEED, robust_row(x, P_sqrt, h_row, -v, speed * speed + sigma * sigma, f, keep, move))
+        if not timed(fil):
+            take_back(fil, x, P_sqrt, before, work.vector[W_COLUMN])
         h_row[i_v] = 0.0
         return
     certain = v * v > 25.0 * variance_of(P_sqrt, i_v) and abs(v) > 3.0
@@ -539,32 +615,17 @@ def speed_rows(fil, bank, work, h, row):
     h_row[i_l] = -sign * a
     h_row[i_e] = share
     innovation = speed - sign * (v - x[i_l] * a) - share * x[i_e]
+    before = stamps(fil, x, P_sqrt)
     credit(bank, h, BY_SPEED, robust_row(x, P_sqrt, h_row, innovation, sigma * sigma, f, keep, move))
+    if not timed(fil):
+        take_back(fil, x, P_sqrt, before, work.vector[W_COLUMN])
     h_row[i_v] = 0.0
     h_row[i_l] = 0.0
     h_row[i_e] = 0.0
     if i_a >= 0:
         h_row[i_a] = 0.0
     if course_east == course_east and speed > 1.0 and abs(x[i_v]) > 1.0:
-        bend = point[P_CURVATURE]
-        i_t = at[TIME_TAG]
-        step = x[i_s] + x[i_v] * x[i_t] - point[POINT_SIZE]  # the course is of where the fix shows the train
-        te = point[P_D_EAST] + step * bend * point[P_D_NORTH]
-        tn = point[P_D_NORTH] - step * bend * point[P_D_EAST]
-        across = sign * speed * (course_east * tn - course_north * te) / math.hypot(te, tn)
-        across -= sign * speed * bend * fil.lever[0]
-        floor = speed * k[K_COURSE_SIGMA] * (0.2 if stated else 3.0)
-        bent = 0.5 * speed * BEND_CHANGE * variance_of(P_sqrt, i_s)
-        h_row[i_s] = sign * speed * bend
-        h_row[i_t] = h_row[i_s] * x[i_v]
-        variance = sigma * sigma + floor * floor + bent * bent
-        # tracks side by side differ in bearing by less than a model is wrong: only a turnout's leg is evidence
-        doubt = k[K_COURSE_DOUBT] + point[P_SIGMA_CROSS] / BLIND_LENGTH
-        doubt = project(P_sqrt, h_row, f) + variance + (speed * doubt) ** 2
-        work.slot[h, S_COURSE] += -0.5 * (min(across * across / doubt, ROW_GATE) + math.log(doubt))
-        robust_row(x, P_sqrt, h_row, across, variance, f, keep, move)
-        h_row[i_t] = 0.0
-        h_row[i_s] = 0.0
+        course_row(fil, shared, bank, work, h, row, sign, sigma)
 
 
 @part
@@ -580,6 +641,7 @@ def motion_rows(fil, net, shared, bank, work, h, row, dt, still):
         i_v = at[SPEED]
         h_row[i_v] = 1.0
         variance = fil.settings[K_STILL_SIGMA] ** 2
+        before = stamps(fil, bank.x[h], bank.P_sqrt[h])
         rest = robust_row(
             bank.x[h],
             bank.P_sqrt[h],
@@ -590,6 +652,8 @@ def motion_rows(fil, net, shared, bank, work, h, row, dt, still):
             work.vector[W_KEEP],
             work.vector[W_MOVE],
         )
+        if not timed(fil):
+            take_back(fil, bank.x[h], bank.P_sqrt[h], before, work.vector[W_COLUMN])
         credit(bank, h, BY_STANDSTILL, rest)
         h_row[i_v] = 0.0
     if at[GYRO_BIAS] >= 0 and dt > 0.0 and (row[YAW_RATE] == row[YAW_RATE] or row[SIDE] == row[SIDE]):
@@ -599,7 +663,7 @@ def motion_rows(fil, net, shared, bank, work, h, row, dt, still):
     if fil.reads_balises == 1:
         missed_balises(fil, net, bank, h)
     if row[GNSS_SPEED] == row[GNSS_SPEED] and at[SPEED_LATENCY] >= 0 and shared.common[C_SPEED_STALE] == 0.0:
-        speed_rows(fil, bank, work, h, row)
+        speed_rows(fil, shared, bank, work, h, row)
 
 
 @part
