@@ -68,9 +68,26 @@ def test_python_runs(folder, monkeypatch):
 
 
 def test_links_lead_somewhere():
-    for target in re.findall(r"\]\(([^)#]+)\)", README):
-        if "://" not in target:
-            assert (Path(__file__).parents[2] / target).exists(), target
+    """Those of every page, headings within a page included."""
+    root = Path(__file__).parents[2]
+    links = 0
+    for page in [*root.glob("*.md"), *root.glob("docs/**/*.md"), *root.glob("track_models/*.md")]:
+        for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+            if "://" in target or target.startswith("mailto:"):
+                continue
+            file, _, heading = target.partition("#")
+            there = page.parent / file if file else page
+            assert there.exists(), f"{page.name}: {target}"
+            if heading:
+                text = there.read_text(encoding="utf-8")
+                titles = [
+                    re.sub(r"[^\w\- ]", "", line.lstrip("# ").lower()).replace(" ", "-")
+                    for line in text.splitlines()
+                    if line.startswith("#")
+                ]
+                assert heading in titles, f"{page.name}: {target}"
+            links += 1
+    assert links >= 40
 
 
 @pytest.mark.slow

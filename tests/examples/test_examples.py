@@ -47,7 +47,7 @@ def test_simulate_and_judge(capsys):
 def test_build_and_navigate(capsys):
     model, evaluation = run("build_and_navigate")
     assert "built from 3 runs" in capsys.readouterr().out
-    assert model.lengths.sum() == pytest.approx(3011.6, abs=40.0)
+    assert model.lengths.sum() == pytest.approx(3011.6, abs=3.0)
     assert evaluation.availability > 0.95
     assert evaluation.along_statistics.rms < 3.0
     assert evaluation.across_statistics.rms < 0.05

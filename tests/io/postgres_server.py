@@ -65,7 +65,7 @@ def running_server() -> Iterator[str]:
             os.chown(secret, who["user"], who["group"])
         environment = {**os.environ, "LC_ALL": "C.UTF-8", "HOME": str(folder)}
         made = subprocess.run(
-            [programs / "initdb", "-D", folder / "data", "-U", "tester", "-A", "scram-sha-256", "--pwfile", secret, "-E", "UTF8"],
+            [programs / "initdb", "-D", folder / "data", "-U", "tester", "-A", "scram-sha-256", "--pwfile", secret, "-E", "UTF8", "-N"],
             capture_output=True, text=True, timeout=120, cwd=folder, env=environment, **who,
         )  # fmt: skip
         if made.returncode != 0:
@@ -85,7 +85,7 @@ def running_server() -> Iterator[str]:
         yield address
     finally:
         if server is not None:
-            server.send_signal(signal.SIGINT)  # fast shutdown
+            server.send_signal(signal.SIGQUIT)  # at once: what it holds is thrown away
             try:
                 server.wait(timeout=20)
             except subprocess.TimeoutExpired:

@@ -41,7 +41,7 @@ def test_arrow_takes_a_model_without_being_told(model):
 
 @pytest.mark.parametrize("layer", LAYERS)
 def test_every_layer_is_a_frame(model, layer):
-    geopandas = pytest.importorskip("geopandas")
+    geopandas = pytest.importorskip("geopandas", reason="geopandas is not installed (extra frames)")
     frame = model.to_geodataframe(layer)
     rows = {
         "tracks": len(model.track_id), "knots": len(model.offset), "nodes": len(model.nodes.id),
@@ -62,7 +62,7 @@ def test_every_layer_is_a_frame(model, layer):
 
 
 def test_a_solution_is_a_frame(solution, model):
-    pytest.importorskip("geopandas")
+    pytest.importorskip("geopandas", reason="geopandas is not installed (extra frames)")
     table = pa.table(solution)
     assert table.column_names[:4] == ["time_s", "track", "offset_m", "line"]
     placed = solution.track >= 0
@@ -76,8 +76,8 @@ def test_a_solution_is_a_frame(solution, model):
 
 
 def test_frames_go_to_files_of_gis_programs_and_back(model, tmp_path):
-    geopandas = pytest.importorskip("geopandas")
-    pytest.importorskip("pyogrio")
+    geopandas = pytest.importorskip("geopandas", reason="geopandas is not installed (extra frames)")
+    pytest.importorskip("pyogrio", reason="pyogrio is not installed (extra frames)")
     tracks = model.to_geodataframe("tracks")
     tracks.to_file(tmp_path / "tracks.gpkg", driver="GPKG")
     again = geopandas.read_file(tmp_path / "tracks.gpkg")

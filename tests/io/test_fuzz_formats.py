@@ -177,7 +177,7 @@ def good_file(kind: str, model: TrackModel, folder: Path):
         path.write_text(reports())
         return path, lambda p: read_log(p, "gpsd", start=datetime(2025, 7, 8, 23, 59, 58, tzinfo=UTC))
     if kind == "bag":
-        pytest.importorskip("rosbags")
+        pytest.importorskip("rosbags", reason="rosbags is not installed (extra bags)")
         from test_logs import write_bag
 
         write_bag(folder / "bag")

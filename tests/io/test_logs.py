@@ -400,7 +400,7 @@ def test_broken_frames_are_left_out(tmp_path):
 
 
 def write_bag(path, *, two=False, stamped=True):
-    pytest.importorskip("rosbags")
+    pytest.importorskip("rosbags", reason="rosbags is not installed (extra bags)")
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 

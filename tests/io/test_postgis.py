@@ -126,7 +126,7 @@ def test_programs_open_the_geometry(server, model):
 
 
 def test_geopandas_opens_them_as_other_programs_do(server, model):
-    geopandas = pytest.importorskip("geopandas")
+    geopandas = pytest.importorskip("geopandas", reason="geopandas is not installed (extra frames)")
     postgis.write_model(model, f"{server}?model=frames")
     with psycopg.connect(server) as connection:
         blobs = connection.execute('SELECT ST_AsBinary(geom) FROM railnav."frames tracks" ORDER BY fid').fetchall()

@@ -139,9 +139,8 @@ def test_an_outage_is_bridged_better_the_more_is_known(drive):
 def test_a_wrong_mounting_is_levelled_and_said(drive):
     run = as_run(drive, 3, mounting=(3 * DEGREE, 12 * DEGREE, 0.0), stated=(0.0, 0.0, 0.0))
     solution = navigate_inertial(run, scheme="odometer")
-    assert solution.diagnostics["levelled_pitch_deg"] == pytest.approx(-12.0, abs=1.5) or solution.diagnostics[
-        "levelled_pitch_deg"
-    ] == pytest.approx(12.0, abs=1.5)
+    assert solution.diagnostics["levelled_pitch_deg"] == pytest.approx(12.0, abs=1.0)
+    assert solution.diagnostics["levelled_roll_deg"] == pytest.approx(3.0, abs=1.2)
     _, along, across, *_ = errors(drive, solution)
     assert np.sqrt(np.mean(along**2 + across**2)) < 3.5
 
