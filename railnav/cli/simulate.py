@@ -103,7 +103,7 @@ def command(
     simulated: they show what the program does, not what a real line is like.
 
     \b
-    Examples:
+    Example:
       railnav simulate -m demo/bundled.gpkg -o run --route 77R-01,77R-13 --seed 7
       railnav simulate -m demo/bundled.gpkg -o car --grade geometry --route 77R-03 --start 2026-03-01
     """  # noqa: D301
