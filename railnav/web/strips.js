@@ -26,7 +26,10 @@
     const x = [], y = [];
     const part = Math.max(1, Math.ceil(2 * (b - a + 1) / most));
     const put = function (i) {
-      x.push(between(fine.nodes[0], fine.nodes[1], fine.first + i * fine.step));
+      const at = between(fine.nodes[0], fine.nodes[1], fine.first + i * fine.step);
+      // kilometres are missing here: the curve breaks
+      if (x.length && Math.abs(at - x[x.length - 1]) > 0.003 * (part + 1) * fine.step + 0.0005) { x.push(at); y.push(null); }
+      x.push(at);
       y.push(whole[i] === -32768 ? null : whole[i] * scale);
     };
     for (let i = a; i <= b; i += part) {

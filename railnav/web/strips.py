@@ -33,8 +33,8 @@ STRIP, GAP = 96, 0.22
 JUMP = 0.5
 #: What stands for an unknown value among packed ones.
 UNKNOWN = -32768
-#: Jumps drawn in one chart.
-JUMPS_DRAWN = 60
+#: Jumps drawn in one chart, and the most that are named.
+JUMPS_DRAWN, JUMPS_NAMED = 60, 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,6 +127,9 @@ def stack(
         Moves the marker of the map.
     """
     x, title = axis_of(section, distance)
+    jumps = jumps_of(section, distance)
+    # where kilometres are missing there is no track: curves break there
+    breaks = np.array([before / 1e3 for _, before, _ in jumps]) if title.startswith("chainage") else np.empty(0)
     layout = figures._layout(height * len(strips) + 110, hovermode="x", showlegend=legend)
     data: list[dict[str, Any]] = []
     packed: dict[str, Any] = {}
@@ -140,11 +143,12 @@ def stack(
             kept = np.union1d(figures.thin(POINTS, curve.y), gaps)
             if curve.fine > 0.0 and len(kept) < len(curve.y):
                 packed[str(len(data))] = pack(curve.y, curve.fine)
+            at = np.searchsorted(curve.x[kept], breaks, side="right")
             data.append(
                 figures._line(
                     escape(curve.name),
-                    curve.x[kept],
-                    curve.y[kept],
+                    np.insert(curve.x[kept], at, breaks),
+                    np.insert(curve.y[kept], at, np.nan),
                     curve.colour,
                     yaxis=axis,
                     line={"width": 1.1, "dash": curve.dash},
@@ -174,8 +178,7 @@ def stack(
             }
         )
         layout.setdefault("shapes", []).extend(_line_across(axis, value, colour) for value, colour in strip.lines)
-    if title.startswith("km along"):
-        _mark_jumps(layout, jumps_of(section, distance))
+    _mark_jumps(layout, jumps, title.startswith("chainage"))
     layout["xaxis"] = figures._axis(
         title, anchor=f"y{len(strips)}" if len(strips) > 1 else "y", domain=[0, 1], showspikes=True, spikemode="across"
     )
@@ -183,7 +186,9 @@ def stack(
     layout["legend"] = {**layout["legend"], "y": 1.0 + 34.0 / (height * len(strips))}
     fine = None
     if packed:
-        nodes = np.unique(np.append(np.arange(0, len(distance), max(1, len(distance) // 2000)), len(distance) - 1))
+        even = np.arange(0, len(distance), max(1, len(distance) // 2000))
+        after = np.searchsorted(distance, [where for where, _, _ in jumps])
+        nodes = np.unique(np.concatenate([even, after, np.maximum(after - 1, 0), [len(distance) - 1]]))
         fine = {
             "first": float(distance[0]),
             "step": float(distance[1] - distance[0]),
@@ -199,28 +204,31 @@ def _line_across(axis: str, value: float, colour: str) -> dict[str, Any]:
     return {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "yref": axis, "y0": value, "y1": value, "line": stroke}
 
 
-def _mark_jumps(layout: dict[str, Any], jumps: Sequence[tuple[float, float, float]]) -> None:
-    """Thin lines where the published kilometres jump, with what they jump from and to."""
+def _mark_jumps(layout: dict[str, Any], jumps: Sequence[tuple[float, float, float]], by_chainage: bool) -> None:
+    """Mark where the published kilometres jump, with what they jump from and to: a line, or grey where kilometres are missing."""
     for where, before, after in jumps[:JUMPS_DRAWN]:
+        ends = (before / 1e3, after / 1e3) if by_chainage else (where / 1e3, where / 1e3)
         layout["shapes"].append(
             {
-                "type": "line",
+                "type": "rect",
+                "layer": "below",
                 "xref": "x",
                 "yref": "paper",
-                "x0": where / 1e3,
-                "x1": where / 1e3,
+                "x0": ends[0],
+                "x1": ends[1],
                 "y0": 0,
                 "y1": 1,
-                "line": {"color": figures.SOFT, "width": 1, "dash": "dash"},
+                "fillcolor": "rgba(93,107,118,0.10)",
+                "line": {"color": figures.SOFT, "width": 0 if by_chainage else 1, "dash": "dash"},
             }
         )
-        if len(jumps) <= 12:
+        if len(jumps) <= JUMPS_NAMED:
             layout["annotations"].append(
                 {
                     "text": f"km {before / 1e3:.3f} | {after / 1e3:.3f}",
                     "xref": "x",
                     "yref": "paper",
-                    "x": where / 1e3,
+                    "x": ends[0],
                     "y": 0,
                     "yanchor": "bottom",
                     "showarrow": False,

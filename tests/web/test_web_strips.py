@@ -153,6 +153,31 @@ def test_a_chart_along_kilometres_that_jump_runs_by_distance_and_marks_the_jumps
     assert jumps_of(section_of(line(), [TRACK]), d) == []
 
 
+def test_a_curve_breaks_where_kilometres_are_missing():
+    """Kilometres that jump ahead grow steadily: the chart runs by chainage, and no curve is drawn where there is no track."""
+    which = line().track_index(TRACK)
+    posts = MilePosts(
+        np.full(4, which), np.array([0.0, 2000.0, 2000.01, 9000.0]), np.array([50_000.0, 52_000.0, 52_400.0, 59_399.99])
+    )
+    section = section_of(replace(line(), mileposts=posts), [TRACK])
+    d = section.grid(0.25)
+    x, title = axis_of(section, d)
+    assert title == "chainage, km"
+    figure = stack(
+        [Strip("s", [Curve("c", x, np.sin(d), "#000", fine=0.01)])], identity="i", section=section, distance=d
+    )
+    trace = figure.data[0]
+    at, values = np.asarray(trace["x"]), np.asarray(trace["y"])
+    k = int(np.searchsorted(at, 52.2))
+    assert np.isnan(values[k - 1])
+    assert at[k - 1] < 52.001
+    assert at[k] > 52.399
+    (grey,) = [shape for shape in figure.layout["shapes"] if shape["type"] == "rect"]
+    assert (grey["x0"], grey["x1"]) == pytest.approx((52.0, 52.4), abs=1e-3)
+    nodes = np.array(figure.fine["nodes"])
+    assert np.interp(d, *nodes) == pytest.approx(x, abs=2e-4)  # the values as measured stand where they belong
+
+
 def test_resolution_is_worth_what_is_known():
     assert resolution_of(0.04, 100.0) == pytest.approx(0.01)
     assert resolution_of(20.0, 10.0) == pytest.approx(0.05)
