@@ -31,6 +31,8 @@ TABLE_ENDINGS = (".csv", ".parquet")
     metavar="TRACK,TRACK",
     help="The section: tracks in order.  [default: the longest way that a run covers]",
 )
+@click.option("--between", metavar="FROM-TO", help="Only this stretch, metres along the section, e.g. 1200-1800.")
+@click.option("--km", metavar="FROM-TO", help="Only this stretch, published kilometres, e.g. 45.2-47.1.")
 @click.option(
     "--step", type=click.FloatRange(0.5, 20), default=5.0, show_default=True, help="Distance between slews, m."
 )
@@ -78,6 +80,8 @@ def command(
     report: Path | None,
     axis: Path | None,
     tracks: str | None,
+    between: str | None,
+    km: str | None,
     step: float,
     cutoff: float,
     fixed: Path | None,
@@ -116,11 +120,15 @@ def command(
         _files.check_output(axis, _files.EXPORT_ENDINGS, inputs=[*inputs, output, *([report] if report else [])])
     if least_lift > most_lift:
         raise click.UsageError(f"--least-lift {least_lift:g} is above --most-lift {most_lift:g}")
+    if between is not None and km is not None:
+        raise click.UsageError("--between and --km both name the stretch: give one")
+    stretch = _stretch(between or km or "", "--between" if between is not None else "--km")
     if design is None and (alignment is not None or design_crs is not None):
         raise click.UsageError("--alignment and --design-crs go with --design")
     from railnav.io.lining import read_fixed_points, write_plan
     from railnav.io.run import read_run
     from railnav.monitoring.lining import LiningLimits, line_up
+    from railnav.monitoring.position import stretch_of
     from railnav.monitoring.survey_section import measured_section
 
     reference = _files.read_model(model)
@@ -138,6 +146,9 @@ def command(
     with progress() as tell:
         recorded = [read_run(run) for run in runs]
         measured, surveyed = measured_section(recorded, reference, tracks=names, progress=tell)
+        if stretch is not None:
+            scale = 1.0 if km is None else 1e3
+            measured = stretch_of(measured, scale * stretch[0], scale * stretch[1], by_chainage=km is not None)
         slews, lifts = read_fixed_points(fixed, measured.section) if fixed is not None else ((), ())
         if tell:
             tell("line", 0, 1)
@@ -172,6 +183,23 @@ def command(
     print_warnings(plan.notes)
     _print(plan)
     click.echo(f"{', '.join(str(path) for path in (output, report, axis) if path is not None)} written")
+
+
+def _stretch(text: str, option: str) -> tuple[float, float] | None:
+    """From and to, in the option's unit; None for no text."""
+    from math import isfinite
+    from re import fullmatch
+
+    if not text:
+        return None
+    found = fullmatch(r"\s*(-?[\d.]+)\s*-\s*(-?[\d.]+)\s*", text)
+    try:
+        ends = tuple(float(value) for value in found.groups()) if found else ()
+    except ValueError:
+        ends = ()
+    if len(ends) != 2 or not all(isfinite(value) for value in ends) or ends[0] == ends[1]:
+        raise click.BadParameter(f"{text!r} is not FROM-TO, e.g. 45.2-47.1", param_hint=option)
+    return ends[0], ends[1]
 
 
 def facts(plan: LiningPlan) -> dict[str, Any]:

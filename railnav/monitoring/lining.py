@@ -356,9 +356,8 @@ def _longest(measured: MeasuredAxis, notes: list[str]) -> slice:
     if length < SHORTEST:
         raise TrackError(f"the longest stretch measured without a gap is {length:.0f} m; lining takes {SHORTEST:.0f} m")
     if b - a < len(measured.right):
-        notes.append(
-            f"lined from {measured.distance[a]:.0f} to {measured.distance[b - 1]:.0f} m: the runs leave gaps beyond"
-        )
+        ends = f"{measured.distance[a]:.0f} to {measured.distance[b - 1]:.0f} m along the section"
+        notes.append(f"lined from {ends}: beyond, nothing was measured or asked for")
     return slice(a, b)
 
 

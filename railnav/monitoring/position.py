@@ -144,6 +144,49 @@ class MeasuredAxis:
     noise_up: tuple[AxisNoise, ...] = ()
 
 
+def stretch_of(measured: MeasuredAxis, start: float, finish: float, *, by_chainage: bool = False) -> MeasuredAxis:
+    """The part of a measured axis between two places; what lies beyond counts as not measured.
+
+    Parameters
+    ----------
+    measured : MeasuredAxis
+    start, finish : float
+        Distances along the section, or published chainages, m.
+    by_chainage : bool
+
+    Returns
+    -------
+    MeasuredAxis
+
+    Raises
+    ------
+    TrackError
+        Nothing of the section lies between them, or the published kilometres name more than one stretch of it.
+    """
+    low, high = min(start, finish), max(start, finish)
+    along = measured.distance
+    if by_chainage:
+        along = measured.section.model.chainage(*measured.section.locate(measured.distance))
+        if not np.isfinite(along).any():
+            raise TrackError(
+                f"section {measured.section.name} has no published kilometres; name the stretch by metres along it"
+            )
+    inside = (along >= low - 1e-6) & (along <= high + 1e-6)
+    parts = stretches(inside)
+    unit, scale = ("km", 1e3) if by_chainage else ("m", 1.0)
+    words = f"{low / scale:g} to {high / scale:g} {unit}"
+    if not parts:
+        there = f"{np.nanmin(along) / scale:.6g} to {np.nanmax(along) / scale:.6g} {unit}"
+        raise TrackError(f"{words} does not lie on section {measured.section.name}, which has {there}")
+    if len(parts) > 1:
+        where = ", ".join(f"{measured.distance[a]:.0f} to {measured.distance[b - 1]:.0f} m" for a, b in parts[:4])
+        raise TrackError(
+            f"{words} names {len(parts)} stretches of section {measured.section.name} ({where} along it): its kilometres jump; name one "
+            "by metres"
+        )
+    return replace(measured, right=np.where(inside, measured.right, np.nan), up=np.where(inside, measured.up, np.nan))
+
+
 def measured_axis(section: Section, recordings: Sequence[Recording], *, step: float = 0.5) -> MeasuredAxis:
     """Join the positions and angles of runs into one measured axis beside the model.
 

@@ -321,7 +321,26 @@ def test_a_run_that_covers_a_part_of_the_section_is_said(cars, tmp_path):
     assert f"of the {line().length(TRACK):.0f} m asked for" in err
     code, _, err = run("lining", cars / "car-1", "-m", cars / "line.gpkg", "-o", tmp_path / "p.csv", *section)
     assert code == 0
-    assert "the runs leave gaps beyond" in err
+    assert "beyond, nothing was measured or asked for" in err
+
+
+def test_a_stretch_is_named_by_metres_or_kilometres(cars, tmp_path):
+    words = ["lining", cars / "car-1", "-m", cars / "line.gpkg", "-o", tmp_path / "plan.csv", "--json"]
+    code, out, err = run(*words, "--between", "800-1400")
+    assert code == 0, err
+    assert json.loads(out)["length_m"] == pytest.approx(600.0)
+    first = float(line().at(TRACK, 1000.0).chainage) / 1e3
+    code, out, err = run(*words, "--km", f"{first}-{first + 0.5}")
+    assert code == 0, err
+    assert json.loads(out)["length_m"] == pytest.approx(500.0, abs=6.0)
+    for more, code_, said in (
+        (["--km", "5-6"], 1, "5 to 6 km does not lie on section"),
+        (["--between", "800"], 2, "'800' is not FROM-TO"),
+        (["--between", "1-2", "--km", "1-2"], 2, "both name the stretch"),
+    ):
+        code, _, err = run(*words, *more)
+        assert code == code_
+        assert said in err
 
 
 def test_usage_that_cannot_be_meant(cars, tmp_path):

@@ -13,10 +13,11 @@ from railnav.errors import InputError, TrackError
 from railnav.io.lining import read_fixed_points, write_plan
 from railnav.monitoring.filters import D1, D2, D3_ALIGNMENT, band_pass
 from railnav.monitoring.lining import LiningLimits, line_up
-from railnav.monitoring.position import MeasuredAxis, band_sigma, measured_axis
+from railnav.monitoring.position import MeasuredAxis, band_sigma, measured_axis, stretch_of
 from railnav.monitoring.recording import record
 from railnav.monitoring.section import onto, passages_of, section_of
 from railnav.monitoring.smoothing import Bounds, FixedPoint, InfeasibleError, corrections, feasible, whittaker
+from railnav.track.model import MilePosts
 
 
 def section():
@@ -448,7 +449,6 @@ def test_kilometres_that_jump_back_keep_their_places_apart(tmp_path):
     """A station equation at 200 m sends the kilometres back by 300 m: one chainage, two places, told apart by track and offset."""
     import csv
 
-    from railnav.track.model import MilePosts
     from railnav.web.strips import axis_of
 
     which = line().track_index(TRACK)
@@ -457,6 +457,13 @@ def test_kilometres_that_jump_back_keep_their_places_apart(tmp_path):
     )
     made = axis(np.zeros(800), np.zeros(800))
     made = replace(made, section=section_of(replace(line(), mileposts=posts), [TRACK]))
+    with pytest.raises(
+        TrackError, match=r"50\.05 to 50\.09 km names 2 stretches .* \(50 to 90 m, 350 to 390 m along it\)"
+    ):
+        stretch_of(made, 50_050.0, 50_090.0, by_chainage=True)
+    assert line_up(stretch_of(made, 50_100.0, 50_200.0, by_chainage=True)).distance[[0, -1]] == pytest.approx(
+        [100.0, 200.0]
+    )
     plan = line_up(made)
     write_plan(plan, tmp_path / "plan.csv")
     with (tmp_path / "plan.csv").open(encoding="utf-8") as file:
@@ -495,11 +502,24 @@ def test_gaps_and_short_stretches():
     y[300:320] = np.nan
     plan = line_up(axis(y))
     assert plan.distance[0] == pytest.approx(160.0)
-    assert any("leave gaps" in note for note in plan.notes)
+    assert any("nothing was measured or asked for" in note for note in plan.notes)
     with pytest.raises(TrackError, match="longest stretch measured without a gap is"):
         line_up(axis(np.where(np.arange(800) % 100 == 0, np.nan, 0.0)))
     with pytest.raises(TrackError, match="nothing was measured"):
         line_up(axis(np.full(800, np.nan)))
+
+
+def test_a_stretch_is_lined_by_itself():
+    made = axis(0.01 * np.sin(np.arange(1600) / 20.0))
+    plan = line_up(stretch_of(made, 500.0, 200.0))
+    assert plan.distance[[0, -1]] == pytest.approx([200.0, 500.0])
+    assert plan.slew[[0, -1]] == pytest.approx([0.0, 0.0], abs=1e-9)
+    with pytest.raises(TrackError, match=r"20000 to 30000 m does not lie on section .*, which has 0 to 799\.5 m"):
+        stretch_of(made, 2e4, 3e4)
+    bare = replace(line(), mileposts=MilePosts(*(np.empty(0, kind) for kind in (int, float, float))))
+    without = replace(made, section=section_of(bare, [TRACK]))
+    with pytest.raises(TrackError, match="has no published kilometres"):
+        stretch_of(without, 0.0, 1.0, by_chainage=True)
 
 
 def test_limits_that_no_plan_keeps_are_said():
