@@ -196,16 +196,17 @@ def test_the_verbs_as_they_are_stated(here: Path) -> None:
 
 
 def test_chainage_of_a_file_becomes_line_references(here: Path) -> None:
-    """What an import keeps of posts answers addresses, there and back, also after a refinement of the tracks."""
+    """What an import keeps of posts answers addresses, there and back, also after a train that crossed over refined the tracks."""
     facts = _said("import", "line.geojson", "-o", "m.gpkg", "--spacing", "5")
     assert facts["lines"] == ["77", "78"]
     places = _said("chainage", "m.gpkg", "40.345", "--line", "77")["places"]
     assert isinstance(places, list)
     assert {place["track"] for place in places} >= {"77R-01"}
-    _said("update", "m.gpkg", "service", "-o", "refined.gpkg", "--from-service")
+    _said("simulate", "-m", "m.gpkg", "-o", "crossing", "--route", "77R-01,77X-01,77L-02", "--seed", "3")
+    _said("update", "m.gpkg", "crossing", "-o", "refined.gpkg", "--from-service")
     before, after = read_model(here / "m.gpkg"), read_model(here / "refined.gpkg")
     assert len(after.references) == len(before.references) > 0
-    for name in ("77R-01", "77R-03"):
+    for name in ("77R-01", "77L-03"):
         ends = [
             m.references.offset[m.references.track == m.track_id.index(name)].max() / m.length(name)
             for m in (before, after)
