@@ -11,6 +11,7 @@ import codecs
 import csv
 import io
 import json
+import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -25,9 +26,9 @@ from railnav.errors import InputError
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-#: A text file larger than this is refused: it is read as a whole.
+#: A text file larger than this, or than a quarter of the memory, is refused: it is read as a whole.
 MAX_CSV_BYTES = 4 * 1024**3
-#: Columns that would take more memory than this are refused.
+#: Columns that would take more memory than this, or than half of what the machine has, are refused.
 MAX_TABLE_BYTES = 16 * 1024**3
 #: Endings of Parquet files; anything else is read as CSV.
 PARQUET_ENDINGS = (".parquet", ".pq")
@@ -302,8 +303,9 @@ def _read_csv(path: Path, columns: Sequence[Column], error: type[InputError]) ->
 
     try:
         size = path.stat().st_size
-        if size > MAX_CSV_BYTES:
-            cause = f"is {size / 1e9:.1f} GB; text up to {MAX_CSV_BYTES / 1e9:.1f} GB is read"
+        most = min(MAX_CSV_BYTES, _memory() // 4)
+        if size > most:
+            cause = f"is {size / 1e9:.1f} GB; text up to {most / 1e9:.1f} GB is read on this machine"
             raise error(cause, file=path, remedy="split the run, or store it as .parquet")
         data = path.read_bytes().removeprefix(codecs.BOM_UTF8)
     except OSError as cause:
@@ -425,8 +427,9 @@ def _read_parquet(path: Path, columns: Sequence[Column], error: type[InputError]
             header = list(file.schema_arrow.names)
             _names(path, header, columns, error, "")
             wanted = [column.name for column in columns if column.name in header]
-            if file.metadata.num_rows * len(wanted) * 8 > MAX_TABLE_BYTES:
-                cause = f"has {file.metadata.num_rows} rows; tables up to {MAX_TABLE_BYTES / 1e9:.0f} GB are read"
+            most = min(MAX_TABLE_BYTES, _memory() // 2)
+            if file.metadata.num_rows * len(wanted) * 8 > most:
+                cause = f"has {file.metadata.num_rows} rows; tables up to {most / 1e9:.0f} GB are read on this machine"
                 raise error(cause, file=path, remedy="split the run")
             arrow = file.read(columns=wanted)
             metadata = _metadata(file.schema_arrow.metadata)
@@ -438,6 +441,14 @@ def _read_parquet(path: Path, columns: Sequence[Column], error: type[InputError]
         raise error("has no rows", file=path, remedy="leave the file out where nothing was recorded")
     table = _columns(path, arrow, columns, error)
     return Table(path, table.length, table.number, table.words, metadata, error)
+
+
+def _memory() -> int:
+    """Bytes of the machine's memory; without bound where the system does not tell."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):
+        return 1 << 62
 
 
 def _metadata(schema: Mapping[bytes, bytes] | None) -> dict[str, Any]:

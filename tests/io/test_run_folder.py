@@ -338,15 +338,22 @@ def test_offset_that_merges_stamps_is_refused(folder):
     assert "gnss.csv, row 3, column time_s: two rows at one instant" in refusal(path)
 
 
-def test_huge_files_are_refused(folder, monkeypatch):
-    monkeypatch.setattr(tables, "MAX_CSV_BYTES", 60)
-    assert "gnss.csv: is 0.0 GB; text up to 0.0 GB is read; split the run" in refusal(folder(gnss=GNSS))
-    monkeypatch.setattr(tables, "MAX_TABLE_BYTES", 30)
+@pytest.mark.parametrize("bound", ["constants", "memory"])
+def test_huge_files_are_refused(folder, monkeypatch, bound):
+    """By what is read at most anywhere, and by what this machine can hold."""
+    if bound == "constants":
+        monkeypatch.setattr(tables, "MAX_CSV_BYTES", 60)
+        monkeypatch.setattr(tables, "MAX_TABLE_BYTES", 30)
+    path = folder(gnss=GNSS)
+    if bound == "memory":
+        read_run(path)
+        monkeypatch.setattr(tables, "_memory", lambda: 90)
+    assert "gnss.csv: is 0.0 GB; text up to 0.0 GB is read on this machine; split the run" in refusal(path)
     path = folder(toml='[gnss]\nfile = "gnss.parquet"\n')
     pq.write_table(
         pa.table({"time_s": [0.0, 1.0], "latitude_deg": [0.0, 1.0], "longitude_deg": [0.0, 1.0]}), path / "gnss.parquet"
     )
-    assert "gnss.parquet: has 2 rows; tables up to 0 GB are read" in refusal(path)
+    assert "gnss.parquet: has 2 rows; tables up to 0 GB are read on this machine" in refusal(path)
 
 
 def test_parquet_is_refused_with_its_cause(folder):
