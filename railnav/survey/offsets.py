@@ -228,9 +228,13 @@ def robust_fit(A: FloatArray, d: FloatArray, hold: FloatArray) -> tuple[FloatArr
     best_spread = np.inf
     for start in (plain, np.linalg.solve(A.T @ A + len(A) * ridge, A.T @ d)):
         x: FloatArray = np.asarray(start)
+        kept: BoolArray | None = None
         for _ in range(8):
             e = np.abs(d - A @ x)
             take = e <= 3.0 * max(1.4826 * float(np.median(e)), 1e-3)
+            if kept is not None and np.array_equal(take, kept):
+                break  # settled
+            kept = take
             x = np.asarray(np.linalg.solve(A[take].T @ A[take] + take.sum() * ridge, A[take].T @ d[take]))
         spread = max(1.4826 * float(np.median(np.abs(d - A @ x))), 1e-3)
         if spread < best_spread:

@@ -15,10 +15,7 @@ It is one dictionary of JSON values in `model.provenance["build"]`; an unknown n
 - `datum`: `rule` (plain words), `observable` (bool), `sigma_east_m`, `sigma_north_m`
 - `tracks`: one entry a track: `track`, `length_m`, `runs` (identifiers), `sigma_cross_m` and `sigma_cross_95_m`, `heights` (bool),
   `survey_again`: list of {`from_m`, `to_m`, `sigma_m`, `reason`}
-- `verdicts`: every gross error: `total`, and `list` of the largest (up to 300), each {`what`: "fix" | "stretch" | "link", `run`,
-  `time_s`, `track`, `offset_m`, `easting_m`, `northing_m`, `size`, `unit` ("m", or "rad" for a gyro's slope), `reason`}; where
-  fixes and increments of one run contradicted each other also `fixes` (how many), `statistic` and `limit` (chi-square) and `evidence`:
-  ln odds of this verdict over the other, of two clones
+- `verdicts`: every gross error (`railnav.survey.verdicts`): `total`, and `list` of up to 300
 - `repeatability`: one entry a kind of receiver: axes from single runs of different dates compared, as a histogram
   (`railnav.survey.repeatability`)
 - `warnings`: sentences in plain words
@@ -34,17 +31,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from railnav.survey.angles import slips
 from railnav.survey.axis import ErrorModel
-from railnav.survey.fixes import BEYOND, FAR, LINKS, OTHER_TRACK, REASONS, TURNED, USED, Fixes
+from railnav.survey.fixes import BEYOND, FAR, OTHER_TRACK, REASONS, TURNED, USED, Fixes
 from railnav.survey.offsets import Offsets
 from railnav.survey.repeatability import repeatability
 from railnav.survey.surveyed import Surveyed
+from railnav.survey.verdicts import verdicts
 from railnav.survey.vertical import Heights
 
 if TYPE_CHECKING:
     from railnav.run import Run
-    from railnav.survey.attribution import Attribution
     from railnav.track.alignment import KnotTable
 
 FloatArray = NDArray[np.float64]
@@ -63,8 +59,6 @@ WEAK = 2.0
 SHORTEST_AGAIN, MOST_AGAIN = 50.0, 100
 #: An antenna higher than this above the rails leans noticeably with the cant, m.
 LEAN_HEIGHT = 0.3
-#: Gross errors that are listed.
-MOST_VERDICTS = 300
 #: Receivers differ when their offsets stand this many sigma apart.
 SIGNIFICANT = 3.0
 
@@ -166,7 +160,7 @@ def compose(
         "receivers": receivers,
         "datum": datum,
         "tracks": told,
-        "verdicts": _verdicts(survey, tracks, tables, runs),
+        "verdicts": verdicts(survey.fixes, tracks, tables, runs),
         "repeatability": repeatability(survey.fixes, tracks, offsets),
         "warnings": _warnings(survey, offsets, datum, tracks, heights, runs, told),
         "settings": {
@@ -285,102 +279,6 @@ def rejected(f: Fixes) -> dict[str, Any]:
             ],
         }
     return out
-
-
-def _verdicts(
-    survey: Survey, tracks: Sequence[Surveyed], tables: Sequence[KnotTable], runs: Sequence[dict[str, Any]]
-) -> dict[str, Any]:
-    """Every gross error with time, place, size and reason; the largest are listed."""
-    found: list[dict[str, Any]] = []
-    place: dict[int, tuple[str, FloatArray]] = {}
-    for t, table in zip(tracks, tables, strict=True):
-        stretch = float(table.offset[-1]) / ((len(t.nominal) - 1) * t.nominal.step)
-        for laid, i in zip(t.laid, t.runs, strict=True):
-            place[i] = (t.name, laid.offset * stretch)
-        for k, node, size in slips(t):
-            found.append(
-                {
-                    "what": "link",
-                    "run": survey.fixes[t.runs[k]].run.id,
-                    "time_s": _number(float(t.profile.time[k, node]), 3),
-                    "track": t.name,
-                    "offset_m": _number(node * t.nominal.step * stretch, 1),
-                    "easting_m": _number(float(t.nominal.easting[node]), 2),
-                    "northing_m": _number(float(t.nominal.northing[node]), 2),
-                    "size": _number(size, 5),
-                    "unit": "rad",
-                    "reason": "angle against the axis and its neighbours",
-                }
-            )
-    total = len(found)
-    for i, f in enumerate(survey.fixes):
-        rows = np.flatnonzero(~np.isin(f.reason, (USED, OTHER_TRACK, TURNED, LINKS)))
-        total += len(rows)
-        name, offset = place.get(i, ("", np.full(len(f), np.nan)))
-        offset = offset if len(offset) == len(f) else np.full(len(f), np.nan)
-        if f.attributed is not None:
-            total += len(f.attributed.found)
-            found += [_attributed(f, a, name, offset) for a in f.attributed.found]
-        for j in rows[np.argsort(-f.size[rows], kind="stable")[:MOST_VERDICTS]]:
-            found.append(
-                {
-                    "what": "fix",
-                    "run": f.run.id,
-                    "time_s": _number(f.time[j], 3),
-                    "track": name,
-                    "offset_m": _number(offset[j], 1),
-                    "easting_m": _number(f.easting[j], 2),
-                    "northing_m": _number(f.northing[j], 2),
-                    "size": _number(f.size[j], 2),
-                    "unit": "m",
-                    "reason": REASONS[f.reason[j]],
-                }
-            )
-    for entry in runs:
-        for part in entry["other_track"]:
-            total += 1
-            found.append(
-                {
-                    "what": "stretch",
-                    "run": entry["id"],
-                    "time_s": None,
-                    "track": part["track"],
-                    "offset_m": part["from_m"],
-                    "to_m": part["to_m"],
-                    "size": part["distance_m"],
-                    "unit": "m",
-                    "reason": REASONS[OTHER_TRACK],
-                }
-            )
-    order = {"stretch": 0, "link": 1, "fix": 2}
-    found.sort(key=lambda v: (order[v["what"]], -abs(v["size"] or 0.0)))
-    return {"total": total, "list": found[:MOST_VERDICTS]}
-
-
-def _attributed(f: Fixes, a: Attribution, track: str, offset: FloatArray) -> dict[str, Any]:
-    """One contradiction of fixes and increments as a verdict; its place is that of the fix at which it showed."""
-    at = a.first if a.wrong == "fix" else a.last
-    # a fix that is not used is not laid: its place is between its neighbours
-    known = np.flatnonzero(np.isfinite(offset))
-    here = float(np.interp(at, known, offset[known])) if len(known) else np.nan
-    return {
-        "what": a.wrong,
-        "run": f.run.id,
-        "time_s": _number(a.time, 3),
-        "track": track,
-        "offset_m": _number(here, 1),
-        "easting_m": _number(f.easting[at], 2),
-        "northing_m": _number(f.northing[at], 2),
-        "size": _number(a.size, 3),
-        "unit": "m",
-        "reason": REASONS[LINKS]
-        if a.wrong == "fix"
-        else "odometer or gyroscope contradicts the fixes before and after",
-        "fixes": a.last - a.first + 1 if a.wrong == "fix" else 0,
-        "statistic": _number(a.statistic, 1),
-        "limit": _number(a.limit, 1),
-        "evidence": _number(a.evidence, 1),
-    }
 
 
 def _residuals(t: Surveyed, k: int, offsets: Offsets) -> FloatArray:

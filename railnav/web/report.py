@@ -175,7 +175,7 @@ def track_rows(build: Mapping[str, Any]) -> tuple[Sequence[str], list[list[str]]
     rows = []
     for track in build.get("tracks", []):
         again = track.get("survey_again") or []
-        first = f"{words.length(again[0]['from_m'])} to {words.length(again[0]['to_m'])}" if again else ""
+        first = f"{again[0]['from_m']:,.0f} m to {again[0]['to_m']:,.0f} m" if again else ""
         rows.append(
             [
                 str(track["track"]),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from itertools import pairwise
 from typing import Any
@@ -27,42 +27,8 @@ def survey_sections(build: Mapping[str, Any]) -> list[Section]:
     list of Section
     """
     sections = []
-    again = [
-        (
-            str(t["track"]),
-            str(p.get("reason", "")),
-            f"{p['from_m']:.0f}",
-            f"{p['to_m']:.0f}",
-            words.length(p.get("sigma_m"), 2),
-        )
-        for t in build.get("tracks", [])
-        for p in t.get("survey_again") or []
-    ]
-    if again:
-        many = f"The first {MOST_ROWS} of {len(again)}." if len(again) > MOST_ROWS else ""
-        columns: tuple[str, ...] = ("track", "why", "from, m", "to, m", "largest sigma")
-        sections.append(Section("Where to survey again", many, [Table(columns, again[:MOST_ROWS], 2)]))
-    verdicts = build.get("verdicts") or {}
-    if verdicts.get("list"):
-        rows = [
-            (
-                v["what"], str(v["run"]), str(v["track"]), str(v["reason"]), "" if v["time_s"] is None else f"{v['time_s']:.1f}",
-                "" if v["offset_m"] is None else f"{v['offset_m']:.0f}" + (f" to {v['to_m']:.0f}" if "to_m" in v else ""),
-                "" if v["size"] is None else f"{v['size']:.4f} rad" if v.get("unit") == "rad" else words.length(v["size"], 3),
-                "" if v.get("evidence") is None else f"{v['evidence']:.0f}",
-            )
-            for v in verdicts["list"][:MOST_ROWS]
-        ]  # fmt: skip
-        columns = ("what", "run", "track", "why", "time, s", "offset, m", "size", "evidence")
-        sections.append(
-            Section(
-                "Gross errors",
-                f"The largest of {verdicts['total']:,}: fixes, stretches on another track, and links (angles, odometer). None of them is "
-                "used. Where fixes and increments of one run contradict each other, two clones of its filter went on, one without the "
-                "fix, one without the link: evidence is the logarithm of the odds of what is said over the other.",
-                [Table(columns, rows, 4)],
-            )
-        )
+    if "tracks" in build:
+        sections.append(_again(build["tracks"]))
     found = build.get("repeatability") or []
     if found:
         told = "; ".join(
@@ -77,7 +43,74 @@ def survey_sections(build: Mapping[str, Any]) -> list[Section]:
                 [_histogram(found)],
             )
         )
+    verdicts = build.get("verdicts") or {}
+    if verdicts.get("list"):
+        sections.append(_gross(verdicts))
     return sections
+
+
+def _again(tracks: Sequence[Mapping[str, Any]]) -> Section:
+    """Stretches that deserve another run, or the word that there are none."""
+    rows = [
+        (
+            str(t["track"]),
+            str(p.get("reason", "")),
+            f"{p['from_m']:,.0f}",
+            f"{p['to_m']:,.0f}",
+            words.length(p["to_m"] - p["from_m"], 3),
+            words.length(p.get("sigma_m"), 2),
+        )
+        for t in tracks
+        for p in t.get("survey_again") or []
+    ]
+    if not rows:
+        return Section(
+            "Where to survey again",
+            "Nowhere: no stretch is without fixes, rests on one run of several, or is much weaker than its track.",
+        )
+    many = f"The first {MOST_ROWS} of {len(rows)}." if len(rows) > MOST_ROWS else ""
+    columns = ("track", "why", "from, m", "to, m", "length", "largest sigma")
+    return Section("Where to survey again", many, [Table(columns, rows[:MOST_ROWS], 2)])
+
+
+def _gross(verdicts: Mapping[str, Any]) -> Section:
+    """Gross errors, the gravest first."""
+    rows = [
+        (
+            str(v["what"]),
+            str(v["run"]),
+            str(v["track"]),
+            str(v["reason"]),
+            _span(v["time_s"], v.get("to_time_s"), 1),
+            _span(v["offset_m"], v.get("to_m"), 0),
+            f"{v['fixes']:,}" if v.get("fixes") else "",
+            _size(v),
+            "" if v.get("evidence") is None else f"{v['evidence']:.0f}",
+        )
+        for v in verdicts["list"][:MOST_ROWS]
+    ]
+    columns = ("what", "run", "track", "why", "time, s", "offset, m", "fixes", "size", "evidence")
+    many = f" The table holds the {len(rows)} gravest." if len(verdicts["list"]) > len(rows) else ""
+    return Section(
+        "Gross errors",
+        f"{verdicts['total']:,} fixes, stretches on another track, and links (angles, odometer) were set aside; none of them is used. "
+        "Times count from the start of the run. Where fixes and increments of one run contradicted each other, two clones of its filter "
+        f"went on, one without the fix, one without the link: evidence is the logarithm of the odds of what is said.{many}",
+        [Table(columns, rows, 4)],
+    )
+
+
+def _span(first: float | None, last: float | None, digits: int) -> str:
+    if first is None:
+        return "" if last is None else f"to {last:,.{digits}f}"
+    return f"{first:,.{digits}f}" + ("" if last is None else f" to {last:,.{digits}f}")
+
+
+def _size(verdict: Mapping[str, Any]) -> str:
+    size = verdict["size"]
+    if size is None:
+        return ""
+    return f"{1e3 * size:.1f} mrad" if verdict.get("unit") == "rad" else words.length(size, 3)
 
 
 def _histogram(found: list[dict[str, Any]]) -> Figure:

@@ -511,7 +511,26 @@ def test_every_gross_error_is_told_with_time_place_size_and_reason():
     assert fix["time_s"] == pytest.approx(runs[0].gnss.time[200])
     assert fix["size"] > 1.0
     assert fix["reason"]
+    assert fix["fixes"] == 1
     assert told["total"] >= len(told["list"]) >= 1
+
+
+def test_fixes_that_follow_one_another_are_one_verdict_and_counted_one_by_one():
+    runs, _axis, _frame, _ = single_line(3, km=2.0)
+    latitude = runs[0].gnss.latitude.copy()
+    latitude[200:210] += np.radians(2.0 / 111_000)
+    latitude[400] += np.radians(3.0 / 111_000)
+    told = report(build([changed(runs[0], latitude=latitude), *runs[1:]]))
+    mine = [v for v in told["verdicts"]["list"] if v["what"] == "fix" and v["run"] == "run-1"]
+    t = runs[0].gnss.time
+    many = next(v for v in mine if v["fixes"] >= 10)
+    assert many["fixes"] <= 14  # a neighbour or two, judged by an axis that it had bent
+    assert many["time_s"] == pytest.approx(t[200], abs=0.5)
+    assert many["to_time_s"] == pytest.approx(t[209], abs=0.5)
+    assert many["to_m"] - many["offset_m"] == pytest.approx(9 * 0.2 * 22, rel=0.4)
+    assert any(v["fixes"] == 1 and v["time_s"] == pytest.approx(t[400]) for v in mine)
+    gone = sum(r["count"] for r in told["runs"][0]["fixes"]["rejected"].values())
+    assert told["verdicts"]["total"] >= gone >= 11
 
 
 def test_repeatability_between_dates_is_a_histogram():

@@ -1,0 +1,180 @@
+"""Every gross error of a build with time, place, size and reason: fixes, stretches on another track, and links.
+
+`total` counts single fixes, stretches and links; `list` holds one entry for fixes that follow one another and have one reason. Keys:
+`what`: "fix" | "stretch" | "link"; `run`; `time_s` (None for a stretch), `to_time_s` where it lasts; `track`, `offset_m`, `to_m` where it
+is long; `easting_m`, `northing_m` of its worst; `size` and `unit` ("m", or "rad" for a gyro's slope); `fixes`, how many; `reason`. Where
+fixes and increments of one run contradicted each other (`railnav.survey.attribution`) also `statistic` and `limit` (chi-square) and
+`evidence`: ln odds of this verdict over the other, of two clones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from railnav.survey.angles import slips
+from railnav.survey.fixes import BEYOND, FAR, LINKS, OTHER_TRACK, REASONS, STATED_SIGMA, TURNED, USED, Fixes
+from railnav.survey.surveyed import Surveyed
+
+if TYPE_CHECKING:
+    from railnav.survey.attribution import Attribution
+    from railnav.track.alignment import KnotTable
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+#: Verdicts that are listed.
+MOST_VERDICTS = 300
+#: Fixes of one reason no farther apart than this are one verdict, s.
+TOGETHER = 5.0
+#: What a receiver says itself, or where nothing is to be compared with, comes last in the list.
+MILD = frozenset({REASONS[STATED_SIGMA], REASONS[FAR], REASONS[BEYOND]})
+
+
+def verdicts(
+    fixes: Sequence[Fixes], tracks: Sequence[Surveyed], tables: Sequence[KnotTable], runs: Sequence[dict[str, Any]]
+) -> dict[str, Any]:
+    """Gather the verdicts of a build.
+
+    Parameters
+    ----------
+    fixes : sequence of Fixes
+        Of the runs that took part.
+    tracks : sequence of Surveyed
+    tables : sequence of KnotTable
+        Their knots: offsets are those of the model.
+    runs : sequence of dict
+        Entries of the report, for the stretches on another track.
+
+    Returns
+    -------
+    dict
+        `total` and `list`: stretches first, then links, then fixes, the largest of each first.
+    """
+    found: list[dict[str, Any]] = []
+    place: dict[int, tuple[str, FloatArray]] = {}
+    for t, table in zip(tracks, tables, strict=True):
+        scale = float(table.offset[-1]) / ((len(t.nominal) - 1) * t.nominal.step)
+        for laid, i in zip(t.laid, t.runs, strict=True):
+            place[i] = (t.name, laid.offset * scale)
+        found += [_slip(fixes[t.runs[k]], t, k, node, size, scale) for k, node, size in slips(t)]
+    total = len(found)
+    for i, f in enumerate(fixes):
+        name, offset = place.get(i, ("", np.full(len(f), np.nan)))
+        along = _everywhere(offset)
+        if f.attributed is not None:
+            total += len(f.attributed.found)
+            found += [_attributed(f, a, name, along) for a in f.attributed.found]
+        rows = np.flatnonzero(~np.isin(f.reason, (USED, OTHER_TRACK, TURNED, LINKS)))
+        total += len(rows)
+        found += [_fixes(f, group, name, along) for group in _groups(f, rows)]
+    for entry in runs:
+        for part in entry["other_track"]:
+            total += 1
+            found.append(
+                {
+                    "what": "stretch",
+                    "run": entry["id"],
+                    "time_s": None,
+                    "track": part["track"],
+                    "offset_m": part["from_m"],
+                    "to_m": part["to_m"],
+                    "size": part["distance_m"],
+                    "unit": "m",
+                    "reason": REASONS[OTHER_TRACK],
+                }
+            )
+    order = {"stretch": 0, "link": 1, "fix": 2}
+    found.sort(key=lambda v: (order[v["what"]], v["reason"] in MILD, -abs(v["size"] or 0.0)))
+    return {"total": total, "list": found[:MOST_VERDICTS]}
+
+
+def _number(value: float, digits: int) -> float | None:
+    return round(float(value), digits) if np.isfinite(value) else None
+
+
+def _everywhere(offset: FloatArray) -> FloatArray:
+    """Offsets of all fixes of a run: one that is not laid lies between its neighbours; beyond the ends nowhere."""
+    at = np.flatnonzero(np.isfinite(offset))
+    if not len(at):
+        return offset
+    return np.interp(np.arange(len(offset)), at, offset[at], left=np.nan, right=np.nan)
+
+
+def _groups(f: Fixes, rows: IntArray) -> Iterator[IntArray]:
+    """Fixes that were set aside for one reason, one after the other."""
+    if not len(rows):
+        return
+    apart = (np.diff(f.reason[rows]) != 0) | (np.diff(f.time[rows]) > TOGETHER)
+    yield from np.split(rows, np.flatnonzero(apart) + 1)
+
+
+def _fixes(f: Fixes, group: IntArray, track: str, offset: FloatArray) -> dict[str, Any]:
+    worst = group[int(np.argmax(f.size[group]))]
+    entry = {
+        "what": "fix",
+        "run": f.run.id,
+        "time_s": _number(f.time[group[0]], 3),
+        "track": track,
+        "offset_m": _number(offset[group[0]], 1),
+        "easting_m": _number(f.easting[worst], 2),
+        "northing_m": _number(f.northing[worst], 2),
+        "size": _number(f.size[worst], 2),
+        "unit": "m",
+        "fixes": len(group),
+        "reason": REASONS[f.reason[worst]],
+    }
+    return entry | _until(f, group[-1], group[0], offset)
+
+
+def _until(f: Fixes, last: int, first: int, offset: FloatArray) -> dict[str, Any]:
+    """Where and when a verdict of several fixes ends."""
+    if last == first:
+        return {}
+    out: dict[str, Any] = {"to_time_s": _number(f.time[last], 3)}
+    if abs(offset[last] - offset[first]) > 1.0:
+        out["to_m"] = _number(offset[last], 1)
+    return out
+
+
+def _slip(f: Fixes, t: Surveyed, k: int, node: int, size: float, scale: float) -> dict[str, Any]:
+    """A gyroscope's angle that stands alone against the axis, its neighbours and the other runs."""
+    return {
+        "what": "link",
+        "run": f.run.id,
+        "time_s": _number(float(t.profile.time[k, node]), 3),
+        "track": t.name,
+        "offset_m": _number(node * t.nominal.step * scale, 1),
+        "easting_m": _number(float(t.nominal.easting[node]), 2),
+        "northing_m": _number(float(t.nominal.northing[node]), 2),
+        "size": _number(size, 5),
+        "unit": "rad",
+        "reason": "angle against the axis and its neighbours",
+    }
+
+
+def _attributed(f: Fixes, a: Attribution, track: str, offset: FloatArray) -> dict[str, Any]:
+    """One contradiction of fixes and increments; its place is that of the fix at which it showed."""
+    at = a.first if a.wrong == "fix" else a.last
+    entry = {
+        "what": a.wrong,
+        "run": f.run.id,
+        "time_s": _number(a.time, 3),
+        "track": track,
+        "offset_m": _number(offset[at], 1),
+        "easting_m": _number(f.easting[at], 2),
+        "northing_m": _number(f.northing[at], 2),
+        "size": _number(a.size, 3),
+        "unit": "m",
+        "fixes": a.last - a.first + 1 if a.wrong == "fix" else 0,
+        "reason": REASONS[LINKS]
+        if a.wrong == "fix"
+        else "odometer or gyroscope contradicts the fixes before and after",
+        "statistic": _number(a.statistic, 1),
+        "limit": _number(a.limit, 1),
+        "evidence": _number(a.evidence, 1),
+    }
+    return entry | (_until(f, a.last, a.first, offset) if a.wrong == "fix" else {})
