@@ -524,10 +524,10 @@ def test_fixes_that_follow_one_another_are_one_verdict_and_counted_one_by_one():
     mine = [v for v in told["verdicts"]["list"] if v["what"] == "fix" and v["run"] == "run-1"]
     t = runs[0].gnss.time
     many = next(v for v in mine if v["fixes"] >= 10)
-    assert many["fixes"] <= 14  # a neighbour or two, judged by an axis that it had bent
-    assert many["time_s"] == pytest.approx(t[200], abs=0.5)
-    assert many["to_time_s"] == pytest.approx(t[209], abs=0.5)
-    assert many["to_m"] - many["offset_m"] == pytest.approx(9 * 0.2 * 22, rel=0.4)
+    assert many["fixes"] <= 16  # a few neighbours, judged by an axis that it had bent
+    assert many["time_s"] == pytest.approx(t[200], abs=1.5)
+    assert many["to_time_s"] == pytest.approx(t[209], abs=1.5)
+    assert many["to_m"] - many["offset_m"] == pytest.approx(9 * 0.2 * 22, rel=0.6)
     assert any(v["fixes"] == 1 and v["time_s"] == pytest.approx(t[400]) for v in mine)
     gone = sum(r["count"] for r in told["runs"][0]["fixes"]["rejected"].values())
     assert told["verdicts"]["total"] >= gone >= 11
