@@ -195,7 +195,7 @@ from railnav.navigation.dynamics._kernels import (
     widen,
 )
 from railnav.navigation.integrity import _kernels as integrity
-from railnav.navigation.integrity._kernels import keep_check, stray, weigh_positions
+from railnav.navigation.integrity._kernels import keep_check, stray, watch_misfit, weigh_positions
 from railnav.navigation.measurements import _kernels as measurements
 from railnav.navigation.measurements._kernels import (
     balise_place,
@@ -595,6 +595,7 @@ def fix_all(fil, net, shared, bank, work, row):
             common[C_DISTRUST] = time + DISTRUST
             kick(fil, bank, work, row)
     common[C_SUSPECTS] = 0.0
+    watch_misfit(common, least)
     common[C_FIXES] += 1.0
     held = START_GATE if fresh else k[K_GATE] + 10.0  # evidence against a hypothesis saturates: a fix may be wrong, too
     most = -np.inf

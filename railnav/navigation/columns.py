@@ -214,8 +214,11 @@ OUTPUT_SIZE = 13
     C_BLAMED,  # when wheel and receiver agreed against the accelerometer
     C_BLAMED_WAY,  # how far it may have carried the train astray by then, m
     C_RESCALED,  # when the receiver confirmed the speed against the wheel for long
-) = range(57)
-COMMON_SIZE = 57
+    C_MISFIT,  # squared normalised innovation of fixes a degree of freedom, of late
+) = range(58)
+COMMON_SIZE = 58
+#: Innovations of fixes are judged over so many; their sigmas are too small where the mean square exceeds this.
+MISFIT_FIXES, MISFIT_USUAL = 20.0, 1.4
 #: How often tracks nearby that no hypothesis holds are given a rival, s.
 RIVAL_INTERVAL = 60.0
 #: Odometer readings remembered: time, distance.
@@ -266,6 +269,10 @@ YAW_MISFIT, YAW_SPAN, YAW_DISTRUST = 0.5, 2.0, 60.0
 AGAINST = 0.4
 #: By how much an accelerometer's bias or a wheel's scale may have stepped when the other speeds agree against it.
 FORCE_STEP, SCALE_STEP = 0.3, 0.05
+#: A wheel that turns at less than this share of the speed for long is dead.
+DEAD_WHEEL = 0.2
+#: Inertial means repeat each other when they differ by less (rad/s, m/s^2): the means are differences of sums, with their rounding.
+REPEATED = 1e-9
 #: How often dead reckoning by the wheel begins anew, s.
 CHECK_INTERVAL = 60.0
 #: Way over which inertial rows count once as evidence of a track, m.

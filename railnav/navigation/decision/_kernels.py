@@ -74,7 +74,7 @@ from railnav.navigation.columns import (
     WHEEL_DISTANCE,
 )
 from railnav.navigation.dynamics._kernels import variance_of
-from railnav.navigation.integrity._kernels import mixture_bound, separation_bound
+from railnav.navigation.integrity._kernels import mixture_bound, residual_bound, separation_bound, understated
 from railnav.navigation.measurements._kernels import gravity_pull
 
 
@@ -230,6 +230,7 @@ def put_out(fil, net, shared, bank, work, row, out):
     probability *= 1.0 - common[C_UNSEEN]
     out[OUT_PROBABILITY] = min(probability, 1.0)
     out[OUT_LEVEL] = mixture_bound(work.mix[0], work.mix[1], work.mix[2], live, fil.risk[0], fil.risk[1])
+    out[OUT_LEVEL] = understated(common) * max(out[OUT_LEVEL], residual_bound(fil, shared, bank, work, h))
     if at[WHEEL_DISTANCE] >= 0:
         out[OUT_LEVEL] = max(out[OUT_LEVEL], separation_bound(fil, bank, h, row[TIME]))
     out[OUT_DIRECTION] = way if forward >= DIRECTION_CONFIDENCE * standing else 0.0

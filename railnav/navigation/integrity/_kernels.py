@@ -29,6 +29,12 @@ from railnav.matching._kernels import (
     part,
 )
 from railnav.navigation.columns import (
+    C_FIXES,
+    C_FRAME_SIGMA,
+    C_MISFIT,
+    C_SCALE,
+    C_SIGMA_EAST,
+    C_SIGMA_NORTH,
     CHECK_INTERVAL,
     FRAME_EAST,
     FRAME_NORTH,
@@ -36,9 +42,12 @@ from railnav.navigation.columns import (
     K_ASTRAY_RATE,
     K_ASTRAY_TIME,
     K_ASTRAY_WALK,
+    K_CORRELATED,
     K_GNSS_TIME,
     K_MEMORY,
     K_ODOMETER_SLIP,
+    MISFIT_FIXES,
+    MISFIT_USUAL,
     ODOMETER_SCALE,
     POSITION,
     S_ASTRAY,
@@ -169,6 +178,57 @@ def separation_bound(fil, bank, h, time):
     variance = info[CHECK + CHECK_VARIANCE] + info[CHECK + CHECK_SCALE_VARIANCE] * way * way
     variance += k[K_ODOMETER_SLIP] ** 2 * abs(way)
     return apart + fil.risk[2] * math.sqrt(variance)
+
+
+@part
+def residual_bound(fil, shared, bank, work, h):
+    """Bound by solution separation from the fixes alone (22): how far they lie along from the estimate, and what they are worth.
+
+    PL = |e| + K sigma, e the receiver's error along the track as the filter sees it: it is the estimate that is off by that, if a
+    wheel, an inertial sensor or the model's curvature has misled it. K as for dead reckoning; 0 where faults are not reckoned with.
+    """
+    if fil.risk[2] <= 0.0:
+        return 0.0
+    k = fil.settings
+    common = shared.common
+    x = bank.x[h]
+    te, tn = work.point[h, P_D_EAST], work.point[h, P_D_NORTH]
+    size = math.hypot(te, tn)
+    te, tn = te / size, tn / size
+    i_g, i_f = fil.at[GNSS_EAST], fil.at[FRAME_EAST]
+    scale = common[C_SCALE] * k[K_CORRELATED]
+    east, north = scale * common[C_SIGMA_EAST], scale * common[C_SIGMA_NORTH]
+    error = (x[i_f] + east * x[i_g]) * te + (x[i_f + 1] + north * x[i_g + 1]) * tn
+    variance = common[C_FRAME_SIGMA] ** 2 + (east * te) ** 2 + (north * tn) ** 2
+    bound = abs(error) + fil.risk[2] * math.sqrt(variance)
+    # a frame that is off across the track is off along as well, as far as nothing else has told the place
+    info = bank.info[h]
+    framed = math.exp(info[FRAMED] - log_sum(log_sum(info[FADING], info[ASTRAY]), info[FRAMED]))
+    if framed <= fil.risk[0]:
+        return bound
+    share = min(variance_of(bank.P_sqrt[h], fil.at[POSITION]) / variance, 1.0)
+    return max(bound, tail_quantile(fil.risk[0] / framed) * abs(info[FRAMED_CROSS]) * share)
+
+
+@part
+def tail_quantile(risk):
+    """Two-sided normal quantile, k with 2 Q(k) = risk, from above: within 3 % from 1e-9 to 0.3 (Hastings' rational approximation)."""
+    t = math.sqrt(-2.0 * math.log(0.5 * risk))
+    k = t - (2.515517 + t * (0.802853 + t * 0.010328)) / (1.0 + t * (1.432788 + t * (0.189269 + t * 0.001308)))
+    return max(k + 5e-4, 0.0)
+
+
+@part
+def watch_misfit(common, nis):
+    """Follow the squared normalised innovation of fixes in the hypothesis that they fit best, per degree of freedom, over 20 fixes."""
+    share = max(1.0 / MISFIT_FIXES, 1.0 / (1.0 + common[C_FIXES]))
+    common[C_MISFIT] += share * (0.5 * nis - common[C_MISFIT])
+
+
+@part
+def understated(common):
+    """By how much the sigmas of fixes are too small, as their innovations show beyond chance: 1 where they are not."""
+    return math.sqrt(max(common[C_MISFIT] / MISFIT_USUAL, 1.0))
 
 
 @njit(cache=True)

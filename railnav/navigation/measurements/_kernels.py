@@ -67,6 +67,7 @@ from railnav.navigation.columns import (
     C_YAW_DISTRUST,
     COURSE_EAST,
     COURSE_NORTH,
+    DEAD_WHEEL,
     DISTANCE,
     EAST,
     EVIDENCE_STEP,
@@ -296,10 +297,13 @@ def wheel_row(fil, shared, bank, work, h, row, leader):
         longest = time - info[SLIP_SINCE] > k[K_SLIP_LONGEST]
         if longest and second_opinion(shared, time, abs(x[i_v])):
             longest = False  # the receiver confirms the speed: another wheel, or a dead one
-            info[SLIP_SINCE] = -np.inf
             info[AGREE_SINCE] = np.inf
             shared.common[C_ODOMETER_FAULTS] += 1.0
-            shared.common[C_RESCALED] = time
+            if span > 0.0 and abs(wheel) < DEAD_WHEEL * abs(x[i_v]):
+                info[SLIP_SINCE] = time  # it slips on: no scale makes a speed of it
+            else:
+                info[SLIP_SINCE] = -np.inf
+                shared.common[C_RESCALED] = time
         if longest:
             info[SLIP_SINCE] = -np.inf
             info[AGREE_SINCE] = -np.inf

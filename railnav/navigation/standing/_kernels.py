@@ -36,6 +36,7 @@ from railnav.navigation.columns import (
     KICK,
     LEAVING,
     PULLS,
+    REPEATED,
     RING,
     S_SHAKE,
     SIDE,
@@ -114,7 +115,7 @@ def hold_repeated(fil, shared, bank, row):
     for column, last in ((FORCE, C_LAST_FORCE), (SIDE, C_LAST_SIDE), (YAW_RATE, C_LAST_YAW)):
         value = row[column]
         if value == value:
-            if moving and value == common[last]:
+            if moving and abs(value - common[last]) < REPEATED:
                 row[column] = np.nan
                 common[C_REPEATED] += 1.0
             common[last] = value
