@@ -13,14 +13,7 @@ from railnav.simulation import FAULTS, SERVICE, BaliseSensor, Leg, with_fault, w
 from railnav.simulation.faults import Fault
 
 #: Faults that the navigator does not master yet; `docs/accuracy.md` says so.
-NOT_YET = {
-    "gnss-ramp-along-0.1",
-    "gnss-sigma-third",
-    "gnss-frame-9m-south",
-    "odometer-dead",
-    "gyro-saturated",
-    "imu-late-0.2s",
-}
+NOT_YET = {"imu-late-0.2s"}
 
 ONSET = 130.0
 SEEDS = (3, 4)
