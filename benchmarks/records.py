@@ -19,9 +19,15 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "survey"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "navigation"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "estimation"))
 
+import test_joint as trains
+import test_merging as merging
 from survey_simulator import Gyros, Receiver, axis_error, centre_line, drive, knots, plane
+from test_survey_topology import diverging
 
+from railnav.estimation import ChainRecords, change_test, merge_chain, solve_chain
 from railnav.io.run import read_run
 from railnav.survey import build, difference, update
 
@@ -91,6 +97,178 @@ def sequential(seeds: int) -> dict[str, float]:
     return {"ratio_median": float(np.median(ratio)), **{k: float(1e3 * np.sqrt(np.mean(v))) for k, v in errors.items()}}
 
 
+def one_by_one(seeds: int) -> list[dict[str, Any]]:
+    """A build on three runs, then five updates of one run each, against a build of all eight: NEES and RMS after each."""
+    rows = []
+    for kind in ("white GNSS", "correlated GNSS", "correlated GNSS, angles"):
+        nees: list[list[float]] = []
+        square: list[list[float]] = []
+        for seed in range(seeds):
+            rng, frame = np.random.default_rng([seed, 1977]), plane()
+            axis = centre_line(seed, 3.0, frame=frame)
+            runs = drives(axis, frame, rng, "run", 8, 0, **KINDS[kind])
+            model = build(runs[:3])
+            models = [model]
+            for run in runs[3:]:
+                models.append(update(models[-1], [run]))
+            models.append(build(runs))
+            told = [axis_error(m, "up", axis) for m in models]
+            nees.append([float(np.mean((e / s)[20:-20] ** 2)) for e, s in told])
+            square.append([float(np.mean(e[20:-20] ** 2)) for e, _ in told])
+        rows.append(
+            {
+                "kind": kind, "seeds": seeds, "nees": np.mean(nees, axis=0).tolist(),
+                "rms_mm": (1e3 * np.sqrt(np.mean(square, axis=0))).tolist(),
+            }
+        )  # fmt: skip
+    return rows
+
+
+def turnouts(seeds: int) -> dict[str, float]:
+    """A single line with a branch, each way driven twice, updated with as many runs; against a build of all of them."""
+    ratio, before, after = [], [], []
+    for seed in range(seeds):
+        rng, frame = np.random.default_rng([seed, 41]), plane()
+        axis = centre_line(seed, 2.0, frame=frame)
+        branch = axis.shifted(diverging(axis.arc, 0.55 * axis.arc[-1], gap=40.0))
+        old, new = (
+            [
+                r
+                for name, a in (("main", axis), ("branch", branch))
+                for r in drives(a, frame, rng, f"{name}{day}", 2, day)
+            ]
+            for day in (0, 10)
+        )
+        model, batch = build(old), build([*old, *new])
+        updated = update(model, new)
+        if updated.track_id != batch.track_id:
+            continue
+        found = difference(batch, updated)
+        for i, track in enumerate(found.tracks):
+            here = np.flatnonzero(found.track == i)[4:-4]
+            rest = (found.slew - found.common_slew)[here]
+            ratio.append(float(np.nanmean((rest / (found.sigma_slew[here] / np.sqrt(2.0))) ** 2)))
+            if track.startswith("up/"):
+                for m, out in ((model, before), (updated, after)):
+                    errors = [np.mean(axis_error(m, track, a)[0][30:-30] ** 2) for a in (axis, branch)]
+                    out.append(float(min(errors)))
+    return {
+        "tracks": len(ratio), "ratio": float(np.sqrt(np.median(ratio))),
+        "before_mm": 1e3 * float(np.sqrt(np.median(before))), "after_mm": 1e3 * float(np.sqrt(np.median(after))),
+    }  # fmt: skip
+
+
+def longer(seeds: int) -> dict[str, float]:
+    """The middle of a line surveyed three times, then three runs over all of it make it longer; against a build of all six."""
+    squares: dict[str, list[float]] = {"extended": [], "batch": []}
+    nees, length = [], []
+    for seed in range(seeds):
+        rng, frame = np.random.default_rng([seed, 43]), plane()
+        axis = centre_line(seed, 3.0, frame=frame)
+        old = drives(axis, frame, rng, "old", 3, 0, begin=0.25, end=0.75)
+        new = drives(axis, frame, rng, "new", 3, 10)
+        model = update(build(old), new, extend=True)
+        for name, m in (("extended", model), ("batch", build([*old, *new]))):
+            error, sigma = axis_error(m, "up", axis)
+            squares[name].append(float(np.mean(error[20:-20] ** 2)))
+            if name == "extended":
+                nees.append(float(np.mean((error / sigma)[20:-20] ** 2)))
+                length.append(m.length("up") / axis.arc[-1])
+    return {
+        **{k: 1e3 * float(np.sqrt(np.mean(v))) for k, v in squares.items()},
+        "nees": float(np.mean(nees)), "share": float(np.mean(length)), "seeds": seeds,
+    }  # fmt: skip
+
+
+def zones(cases: int) -> list[dict[str, float]]:
+    """The specification's case (rail 18): nodes 1 m apart, fixes of 10 mm every 5 m, increments of 0.5 mm, old axis of five runs.
+
+    10 mm over 60 m; RMS on the plateau after merging 1, 2 and 3 new runs: naively, with what the window test flags forgotten, and with
+    the stretch known exactly.
+    """
+    truth, slewed, across = merging.moved_axis()
+    sides = np.stack([across, np.broadcast_to([0.0, 0.0, 1.0], across.shape)], axis=1)
+    rng = np.random.default_rng(31)
+    exact = np.zeros(len(truth), bool)
+    exact[480:541] = True
+    rows: dict[int, dict[str, list[float]]] = {p: {"naive": [], "flagged": [], "known": []} for p in (1, 2, 3)}
+    for case in range(cases):
+        if case % 20 == 0:
+            stored = merging.model_of(5, truth, rng)
+            old = stored.solve()
+        runs = [merging.survey(slewed, truth, rng) for _ in range(3)]
+        for passes, out in rows.items():
+            new = None
+            for run in runs[:passes]:
+                seen = solve_chain(run if new is None else merge_chain(new, run))
+                new = ChainRecords.of(seen)
+            test = change_test(old, seen, components=sides)
+            if not test.changed.any():
+                continue
+            for name, kept in (
+                ("naive", stored), ("flagged", stored.forgotten(test.nodes())), ("known", stored.forgotten(exact))
+            ):  # fmt: skip
+                for run in runs[:passes]:
+                    solution = solve_chain(merge_chain(kept, run), covariance=False)
+                    kept = ChainRecords.of(solution)
+                error = ((solution.state + truth - slewed) * across).sum(axis=1)[488:533]
+                out[name].append(float(np.mean(error**2)))
+    return [
+        {"passes": p, "found": len(v["known"]), "cases": cases, **{f"{k}_mm": 1e3 * float(np.sqrt(np.mean(e))) for k, e in v.items()}}
+        for p, v in rows.items()
+    ]  # fmt: skip
+
+
+def service(lines: int) -> list[dict[str, float]]:
+    """What a map learns from one train after another (rail 23), its chain stored after each: RMS and NEES, with the NEES' own sigma."""
+    square: dict[int, list[float]] = {}
+    honest: dict[int, list[float]] = {}
+    for line in range(lines):
+        delta, chain = trains.map_errors(600 + line), trains.MapChain.stationary(8200.0, sigma=0.5)
+        for run in range(6):
+            seed = 100_000 + 1000 * (600 + line) + run
+            s, _, _, z, dx = trains.ride(delta, seed)
+            seen = trains.estimate(chain, seed, s, z, dx)
+            chain = seen.chain
+            mean, P = chain.marginals()
+            nodes = slice(seen.first_node + 2, seen.last_node - 2)
+            square.setdefault(run, []).append(float(np.mean((mean[nodes] - delta[nodes]) ** 2)))
+            honest.setdefault(run, []).append(trains.nees(mean[nodes] - delta[nodes], P[nodes]))
+    return [
+        {
+            "passes": k + 1, "lines": lines, "rms_mm": 1e3 * float(np.sqrt(np.mean(square[k]))), "nees": float(np.mean(honest[k])),
+            "nees_sigma": float(np.std(honest[k], ddof=1) / np.sqrt(lines)),
+        }
+        for k in square
+    ]  # fmt: skip
+
+
+def suburban() -> list[dict[str, Any]] | None:
+    """hev_cinkota: three of the five runs, updated with the other two, against a build of all."""
+    folder = _data() / "hev_cinkota"
+    if not folder.is_dir():
+        return None
+    runs = [read_run(d) for d in sorted(folder.iterdir()) if d.is_dir()]
+    batch, first = build(runs), build(runs[0::2])
+    rows = []
+    for name, model in (("three runs", first), ("updated", update(first, runs[1::2]))):
+        found = difference(batch, model)
+        for i, track in enumerate(found.tracks):
+            rest = (found.slew - found.common_slew)[found.track == i]
+            sigma = found.sigma_slew[found.track == i] / np.sqrt(2.0)
+            rows.append(
+                {
+                    "model": name, "track": track, "rms_m": float(np.sqrt(np.nanmean(rest**2))),
+                    "in_sigmas": float(np.sqrt(np.nanmean((rest / sigma) ** 2))),
+                }
+            )  # fmt: skip
+    return rows
+
+
+def _data() -> Path:
+    return Path(os.environ.get("RAILNAV_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
 def slews(cases: int) -> list[dict[str, Any]]:
     """Slews of 60 m with ramps of 8 m found by an update of three runs, old axis of four; and false alarms without one."""
     rows = []
@@ -128,7 +306,7 @@ def slews(cases: int) -> list[dict[str, Any]]:
 
 def real_line() -> dict[str, Any] | None:
     """line80: build on four dates, update with the other four, against a build of all; and how axes repeat."""
-    folder = Path(os.environ.get("RAILNAV_DATA", Path(__file__).parents[2] / "shared" / "data")) / "line80"
+    folder = _data() / "line80"
     if not folder.is_dir():
         return None
     runs = [read_run(d) for d in sorted(folder.iterdir()) if d.name.endswith(("_ublox", "_iphone"))]
@@ -177,6 +355,41 @@ def main() -> None:
         f"\nsimulated: three runs, then three more: RMS {s['first']:.1f} mm, updated {s['updated']:.1f} mm, all six built at once "
         f"{s['batch']:.1f} mm; update and build differ by {s['ratio_median']:.2f} sigma (median of RMS ratios)"
     )
+    figures["one_by_one"] = one_by_one(max(options.seeds // 5, 2))
+    print("\nsimulated: a build on three runs, then five updates of one run each; and all eight built at once")
+    print(
+        "                                   NEES after 0, 1, ... updates           at once   RMS, mm: first   last   at once"
+    )
+    for r in figures["one_by_one"]:
+        nees, rms = r["nees"], r["rms_mm"]
+        print(
+            f"{r['kind']:26}"
+            + "".join(f"{v:7.2f}" for v in nees[:-1])
+            + f"{nees[-1]:12.2f}{rms[0]:15.1f}{rms[-2]:7.1f}{rms[-1]:10.1f}"
+        )
+    figures["turnouts"] = t = turnouts(max(options.seeds // 6, 2))
+    print(
+        f"\nsimulated: a line with a branch, twice as many runs: RMS {t['before_mm']:.1f} mm, updated {t['after_mm']:.1f} mm; "
+        f"update and build of all differ by {t['ratio']:.2f} sigma (median of {t['tracks']} tracks)"
+    )
+    figures["longer"] = g = longer(max(options.seeds // 6, 2))
+    print(
+        f"simulated: half a line made whole by update --extend: RMS {g['extended']:.1f} mm, NEES {g['nees']:.2f}, "
+        f"{100 * g['share']:.1f} % of its length; all runs built at once {g['batch']:.1f} mm ({g['seeds']} lines)"
+    )
+    figures["service"] = service(max(options.seeds * 2 // 3, 4))
+    print(f"\nsimulated: a map of 0.5 m learns from trains (positions 1 m), {figures['service'][0]['lines']} lines")
+    for r in figures["service"]:
+        print(
+            f"  after {r['passes']:.0f} passes  RMS {r['rms_mm']:4.0f} mm   NEES {r['nees']:.2f} (+- {r['nees_sigma']:.2f})"
+        )
+    figures["zones"] = zones(5 * options.slews)
+    print("\nsimulated, the specification's case: 10 mm over 60 m, RMS on the plateau, mm")
+    print("  new runs     found     merged naively   flagged stretch forgotten   stretch known exactly")
+    for r in figures["zones"]:
+        print(
+            f"  {r['passes']:8d} {r['found']:5d} of {r['cases']:3d}{r['naive_mm']:14.2f}{r['flagged_mm']:24.2f}{r['known_mm']:24.2f}"
+        )
     figures["slews"] = slews(options.slews)
     print(
         "\nsimulated, with angles: slew over 60 m, ramps of 8 m     found   false alarms   RMS in it, old axis   updated"
@@ -201,6 +414,11 @@ def main() -> None:
                 f"  axes of single runs of different dates, {r['receiver']}: {r['rms_m']:.2f} m RMS, median {r['median_m']:.2f} m, "
                 f"95 % {r['q95_m']:.2f} m ({r['pairs']} pairs)"
             )
+    figures["hev_cinkota"] = lines = suburban()
+    if lines is not None:
+        print("\nhev_cinkota (phones): built on three runs, updated with two more; against a build of all five:")
+        for r in lines:
+            print(f"  {r['model']:12}{r['track']:20} RMS {r['rms_m']:.2f} m, {r['in_sigmas']:.2f} sigma")
     if options.json:
         options.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
 

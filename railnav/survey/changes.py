@@ -140,6 +140,13 @@ def find_changes(side: Side, joint: Joint, at: IntArray, slack: float, false_ala
             estimates[number] = estimate
     seen, side.axis = side.axis, kept
     old = side.stored.chain().solve()
+    side.alone = np.full(len(side.axis), np.inf)
+    for (a, b), found in zip(parts, estimates, strict=True):
+        assert found is not None
+        lean = found.lean[:, 0, :]
+        own = found.inner[:, 0, 0] + np.einsum("ki,ij,kj->k", lean, border_covariance[:many, :many], lean)
+        # a freer axis is known less well: the variance of a smoothed line goes with the cube root of its noise
+        side.alone[a : b + 1] = own * (FREER ** (-1.0 / 3.0) if side.up else 1.0)
     side.changes = clashes
     clear = ~mask(side, "contradiction")
     for (a, b), found in zip(parts, estimates, strict=True):

@@ -239,7 +239,9 @@ def _track_covariance(side_of: Refinement, side: Side | None, name: str) -> Floa
 
 def _variance(side_of: Refinement, side: Side | None, name: str, stored: AxisRecords | None) -> FloatArray:
     if side is not None and side.estimate is not None:
-        return side.estimate.covariance[:, 0, 0]
+        variance = side.estimate.covariance[:, 0, 0]
+        least = _least(side)
+        return variance if least is None else variance + np.maximum(least - side.estimate.inner[:, 0, 0], 0.0)
     assert stored is not None
     solution = stored.chain().solve()
     assert solution.covariance is not None
@@ -267,7 +269,28 @@ def _keep_side(side_of: Refinement, side: Side, old: int) -> AxisRecords:
         local = surveyed.local_noise(side.estimate, float(np.median(noise)), side.track.nominal.step)
         free = moved[:-1] | moved[1:]
         noise[free] = local[free]
-    return keep_axis(side.estimate, side_of.joint.covariance[np.ix_(at, at)], _weights(side, old), noise)
+    covariance = side_of.joint.covariance[np.ix_(at, at)]
+    return keep_axis(side.estimate, covariance, _weights(side, old), noise, least=_least(side))
+
+
+def _least(side: Side) -> FloatArray | None:
+    """Variance that a merged axis has at least, (N,) m^2: that of two surveys which err alike along the track.
+
+    A stored chain ties neighbours only. What its runs err over a kilometre, in common, it takes for errors that average out, and
+    merged with another run it would be too sure. The exact variance of two merged surveys at a node is at most
+    (1 / P_old + 1 / P_new)^-1 of what each knows there by itself, and is that where their errors are alike along the track
+    (the parallel sum of matrices is concave); as much is kept.
+    """
+    if side.stored is None or side.alone is None:
+        return None
+    solution = side.stored.chain().solve()
+    assert solution.covariance is not None
+    out = np.zeros(len(side.axis))
+    old, new = solution.covariance[:, 0, 0], side.alone[side.old]
+    with np.errstate(divide="ignore"):
+        out[side.old] = np.where(np.isfinite(new), 1.0 / (1.0 / old + 1.0 / new), 0.0)
+    out[mask(side, "moved")] = 0.0
+    return out
 
 
 def _new_borders(side_of: Refinement, counts: dict[str, int], settled: set[tuple[str, str]]) -> Borders:

@@ -50,6 +50,8 @@ class Side:
     changes : list of Change
     beside : (N,) bool array or None
         Nodes where runs are known to be on other tracks.
+    alone : (N,) array or None
+        Variance of the axis as the new runs by themselves know it, m^2; infinite where they do not reach or are set aside.
     excluded : (N,) bool array or None
         Nodes where the new runs are not used.
     estimate : Estimate or None
@@ -65,6 +67,7 @@ class Side:
     first: int = 0
     changes: list[Change] = field(default_factory=list)
     beside: BoolArray | None = None
+    alone: FloatArray | None = None
     excluded: BoolArray | None = None
     estimate: Estimate | None = None
 

@@ -45,7 +45,14 @@ def mean_of(blocks: Sequence[int], weights: Sequence[float], size: int, B: int) 
     return M
 
 
-def keep_axis(estimate: Estimate, border_covariance: FloatArray, M: FloatArray, noise: FloatArray) -> AxisRecords:
+def keep_axis(
+    estimate: Estimate,
+    border_covariance: FloatArray,
+    M: FloatArray,
+    noise: FloatArray,
+    *,
+    least: FloatArray | None = None,
+) -> AxisRecords:
     """Records of one estimated chain about its own estimate, with the common part M theta of its border kept apart.
 
     Parameters
@@ -57,6 +64,8 @@ def keep_axis(estimate: Estimate, border_covariance: FloatArray, M: FloatArray, 
     M : (B, b) array
         The part of the border that is kept apart.
     noise : (N - 1,) array
+    least : (N,) array, optional
+        Variance of the distances that is kept at least, m^2: a chain whose variance is less is told with as much more.
     """
     cross = border_covariance @ M.T
     T = np.linalg.solve(M @ cross, cross.T).T  # (b, B)
@@ -64,6 +73,9 @@ def keep_axis(estimate: Estimate, border_covariance: FloatArray, M: FloatArray, 
     lean, D = estimate.lean, -(estimate.lean @ T)
     P = estimate.inner + lean @ rest @ lean.transpose(0, 2, 1)
     C = estimate.inner_lag + lean[:-1] @ rest @ lean[1:].transpose(0, 2, 1)
+    if least is not None:
+        more = np.sqrt(np.maximum(least / P[:, 0, 0], 1.0))
+        P, C = P * (more**2)[:, None, None], C * (more[:-1] * more[1:])[:, None, None]
     chain = ChainRecords.of_marginals(np.zeros(D.shape[:2]), P, C)
     return AxisRecords.of(chain, D, noise)
 

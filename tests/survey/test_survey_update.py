@@ -403,3 +403,36 @@ def test_records_pack_and_unpack():
     a = AxisRecords(rows, rng.normal(size=(5, 3, 2)), np.ones(4))
     b = AxisRecords.of(a.chain(), a.lean, a.noise)
     assert (a.rows == b.rows).all()
+
+
+@pytest.mark.slow
+def test_updates_of_one_run_each_stay_honest():
+    """Errors that are alike over a kilometre: a stored chain ties neighbours only, and must not take them for many."""
+    nees, square = [], []
+    for seed in range(720, 726):
+        rng, frame = np.random.default_rng([seed, 77]), plane()
+        axis = centre_line(seed, 2.5, frame=frame)
+        runs = drives(axis, frame, rng, 7, "run", 0, stop=0.0)
+        model = build(runs[:3])
+        first = axis_error(model, "up", axis)[0]
+        for run in runs[3:]:
+            model = update(model, [run])
+        error, sigma = axis_error(model, "up", axis)
+        nees.append(np.mean((error / sigma)[20:-20] ** 2))
+        square.append(np.mean(error[20:-20] ** 2) / np.mean(first[20:-20] ** 2))
+    assert 0.6 < np.mean(nees) < 1.4  # 1.7 if every merge is believed
+    assert np.mean(square) < 0.95
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_merged_axis_keeps_the_variance_it_is_told_to(known):
+    rng = np.random.default_rng(2)
+    chain = chain_of(rng, 2, 60)
+    swept = sweep(chain)
+    C = 1e-4 * np.eye(4)
+    estimate = solve(chain, swept, np.zeros(4), C, sure=True)
+    M = mean_of(range(2), [0.5, 0.5], 4, 2)
+    plain = keep_axis(estimate, C, M, chain.noise).chain().solve().covariance[:, 0, 0]
+    least = np.where(np.arange(60) < 30, 4.0, 0.25) * plain
+    kept = keep_axis(estimate, C, M, chain.noise, least=least if known else None).chain().solve().covariance[:, 0, 0]
+    assert np.allclose(kept, np.maximum(least, plain) if known else plain, rtol=1e-6)
