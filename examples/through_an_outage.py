@@ -12,7 +12,7 @@ import numpy as np
 import railnav as rn
 from railnav.navigation.schemes import navigate_inertial
 from railnav.navigation.schemes.arc_run import navigate_arc
-from railnav.simulation import SERVICE, simulate
+from railnav.simulation import SERVICE, Leg, simulate
 
 #: Silence of the receiver, s on the run's clock.
 SILENT = (150.0, 210.0)
@@ -21,8 +21,8 @@ SILENT = (150.0, 210.0)
 def main(seed: int = 2) -> dict[str, float]:
     """Simulate, navigate by each scheme, and find the largest error along in the silence."""
     line = rn.demo_line()
-    way = line.routes("77R-01", "77R-13", at_most=1)[0]
-    run, truth = simulate(line, way, seed=seed, outfit=SERVICE, outages=[SILENT])
+    over = Leg(("77R-01", "77X-01", "77L-02", "77L-03"), start=100.0, finish=7000.0)
+    run, truth = simulate(line, over, seed=seed, outfit=SERVICE, outages=[SILENT])
 
     solutions = {
         "loose": navigate_inertial(run, scheme="loose"),
