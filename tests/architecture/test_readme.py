@@ -50,9 +50,6 @@ def test_commands_run_one_after_another(folder, monkeypatch):
         words = [w for word in shlex.split(command)[1:] for w in expanded(word)]
         result = CliRunner().invoke(main, words)
         assert result.exit_code == 0, f"{command}: {result.output}"
-        if words[0] == "navigate":  # the README evaluates a CSV
-            again = [w.replace("solution.gpkg", "solution.csv") for w in words]
-            assert CliRunner().invoke(main, again).exit_code == 0
 
 
 @pytest.mark.slow
