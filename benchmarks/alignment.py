@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -105,19 +106,41 @@ def mannheim_designs() -> list[Design]:
     return designs
 
 
-def told_apart(design: Design, sigma: float) -> FloatArray:
-    """Which joints of a design points of this noise can show: the joint's change moves the track by over 4 sigmas of its mean.
+def as_chain(design: Design) -> Any:
+    """A design as elements tied to one another, straights that follow each other as one."""
+    from railnav.monitoring.fitting import judgement
 
-    Curvature that jumps by d moves the next element, n points long, by d L^2 / 8 over its own length; one whose rate jumps by r by
-    r L^3 / 48. The shorter of both neighbours counts.
+    plan, items = design.plan, []
+    for j, kind in enumerate(plan.kind.tolist()):
+        if kind == 0 and items and items[-1].kind == 0:
+            items[-1] = replace(items[-1], length=items[-1].length + float(plan.length[j]))
+            continue
+        k0, k1 = float(plan.curvature_start[j]), float(plan.curvature_end[j])
+        smooth = bool(items) and abs(k0 - items[-1].k1) < 1e-6 and max(kind, items[-1].kind) >= 2
+        start = (float(plan.easting[j]), float(plan.northing[j]), float(plan.grid_bearing[j]))
+        items.append(judgement.Item(kind, float(plan.length[j]), k0, k1, start, smooth))
+    return judgement.chain_of(items)
+
+
+def told_apart(design: Design, station: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]:
+    """Joints of a design, and which of them points of this noise can show within 2 m.
+
+    A joint can be shown if its station would be known to 0.5 m by whoever knew which elements there are (the least variance that any
+    fit can have), and if its change moves the track by over 4 sigmas of the mean of the shorter element beside it: curvature that
+    jumps by d moves an element of length L by d L^2 / 8, a rate that jumps by r by r L^3 / 48.
     """
-    plan = design.plan
-    rate = (plan.curvature_end - plan.curvature_start) / plan.length
-    short = np.minimum(plan.length[:-1], plan.length[1:])
-    jump = np.abs(plan.curvature_start[1:] - plan.curvature_end[:-1])
-    bend = np.abs(np.diff(rate))
-    moved = jump * short**2 / 8.0 + bend * short**3 / 48.0
-    return np.asarray(moved > 4.0 * sigma / np.sqrt(np.maximum(short, 1.0)))
+    from railnav.monitoring.fitting.editing import plan_sigmas
+    from railnav.monitoring.fitting.plan import fit_plan
+    from railnav.monitoring.fitting.segmentation import Noise
+
+    chain = as_chain(design)
+    here = design.at(station + design.start)
+    exact = fit_plan(chain, station, here.easting, here.northing, Noise(sigma), steps=0)
+    known = plan_sigmas(exact)[2][1:] < 0.5
+    rate = (chain.k1 - chain.k0) / chain.length
+    short = np.minimum(chain.length[:-1], chain.length[1:])
+    moved = np.abs(chain.k0[1:] - chain.k1[:-1]) * short**2 / 8.0 + np.abs(np.diff(rate)) * short**3 / 48.0
+    return chain.edges[1:-1], np.asarray(known & (moved > 4.0 * sigma / np.sqrt(np.maximum(short, 1.0))))
 
 
 def joints(design: Design, sigma: float = 0.005, seed: int = 0) -> dict[str, Any] | None:
@@ -135,11 +158,12 @@ def joints(design: Design, sigma: float = 0.005, seed: int = 0) -> dict[str, Any
     found = fitted.design
     near = found.stations - found.start + design.start
     at = design.project(found.plan.easting, found.plan.northing, near=near[:-1]).station[1:]
-    true = design.stations[1:-1]
-    visible = told_apart(design, sigma)
+    true, visible = told_apart(design, station, sigma)
+    true = true + design.start
     used = np.zeros(len(at), bool)
     miss: list[float] = []
     hit = np.zeros(len(true), bool)
+    sure = fitted.station_sigma[1:] < 0.5
     for j in range(len(true)):
         gap = np.where(used, np.inf, np.abs(at - true[j])) if len(at) else np.array([np.inf])
         k = int(np.argmin(gap))
@@ -155,6 +179,8 @@ def joints(design: Design, sigma: float = 0.005, seed: int = 0) -> dict[str, Any
         "found": len(at),
         "hit": int(hit.sum()),
         "hit_visible": int((hit & visible).sum()),
+        "sure": int(sure.sum()),
+        "sure_hit": int((sure & used).sum()),
         "miss": miss,
         "axis": float(np.sqrt(np.mean(foot.cross**2))),
         "seconds": seconds,
@@ -258,7 +284,7 @@ def main() -> None:
             print(f"\r{len(rows)}/{len(designs)}", end="", file=sys.stderr)
     total = {
         key: sum(row[key] for row in rows)
-        for key in ("length", "true", "visible", "found", "hit", "hit_visible", "seconds")
+        for key in ("length", "true", "visible", "found", "hit", "hit_visible", "sure", "sure_hit", "seconds")
     }
     miss = np.array([m for row in rows for m in row["miss"]])
     true, seen, found, hit, hit_seen = (total[key] for key in ("true", "visible", "found", "hit", "hit_visible"))
@@ -266,7 +292,9 @@ def main() -> None:
     print(
         f"Mannheim, {len(rows)} axes, {total['length'] / 1e3:.1f} km, 5 mm at 1 m: joints {true}, of them {seen} that such points can "
         f"show; found {found}; within 2 m: {hit}; recall {hit / true:.3f} ({hit_seen / seen:.3f} of those to be seen), precision "
-        f"{hit / found:.3f}; stations rms {np.sqrt(np.mean(miss**2)):.2f} m, median {np.median(miss):.2f} m; axis rms "
+        f"{hit / found:.3f} "
+        f"({total['sure_hit'] / total['sure']:.3f} of the {total['sure']} whose station it knows to 0.5 m); stations "
+        f"rms {np.sqrt(np.mean(miss**2)):.2f} m, median {np.median(miss):.2f} m; axis rms "
         f"{1e3 * np.sqrt(np.mean(axis**2)):.2f} mm, median {1e3 * np.median(axis):.2f} mm; {total['seconds']:.0f} s; failed {len(failed)}"
     )
     for row in sorted(rows, key=lambda row: -row["axis"])[:3]:

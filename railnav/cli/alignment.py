@@ -30,6 +30,13 @@ DESIGN_ENDINGS = (".xml", ".landxml", ".csv")
     type=click.FloatRange(1e-5, 50.0),
     help="White noise of their heights, m.  [default: found from them]",
 )
+@click.option(
+    "--vertical",
+    type=click.Choice(["parabola", "circle"]),
+    default="parabola",
+    show_default=True,
+    help="Vertical curves; heights do not tell which they are.",
+)
 @click.option("--round", "rounded", is_flag=True, help="Round radii and lengths of transitions to design values.")
 @click.option("--ground", is_flag=True, help="Round what they are on the ground, not in the plane.")
 @json_option
@@ -40,6 +47,7 @@ def command(
     report: Path | None,
     sigma: float | None,
     sigma_height: float | None,
+    vertical: str,
     rounded: bool,
     ground: bool,
     as_json: bool,
@@ -87,6 +95,7 @@ def command(
                         axis_of_model(source, name),
                         sigma=sigma,
                         sigma_height=sigma_height,
+                        vertical=vertical,
                         rounded=rounded,
                         on_ground=ground,
                         progress=tell,
@@ -146,6 +155,7 @@ def described(one: Fitted) -> dict[str, Any]:
     """Describe a fitted design in values of JSON."""
     import numpy as np
 
+    from railnav.track.elements import KIND_NAMES
     from railnav.web.alignment import gradient_bars
 
     plan, design = one.design.plan, one.design
@@ -173,7 +183,7 @@ def described(one: Fitted) -> dict[str, Any]:
         }
         for j, kind in enumerate(design.kinds)
     ]
-    sigma = one.profile_sigma
+    sigma = None if one.profile is None else one.profile.sigma
     profile = [
         {
             "piece": bar.kind,
@@ -187,14 +197,18 @@ def described(one: Fitted) -> dict[str, Any]:
     if sigma is not None and len(sigma) == len(profile):
         for row, (at, slope, radius) in zip(profile, sigma.tolist(), strict=True):
             row |= {"station_sigma_m": at, "gradient_sigma": slope, "radius_sigma_m": value(radius)}
-    cant = [] if design.cant is None else [
+    c = design.cant
+    cant = [] if c is None or one.cant is None else [
         {
-            "station_m": float(a + design.start),
-            "length_m": float(b - a),
-            "cant_start_mm": 1e3 * float(u),
-            "cant_end_mm": 1e3 * float(v),
+            "station_m": float(c.edges[j] + design.start),
+            "length_m": float(c.edges[j + 1] - c.edges[j]),
+            "cant_start_mm": 1e3 * float(c.start[j]),
+            "cant_end_mm": 1e3 * float(c.end[j]),
+            "law": KIND_NAMES[c.kind[j]] if c.start[j] != c.end[j] else None,
+            "station_sigma_m": float(one.cant.sigma[j, 0]),
+            "cant_sigma_mm": 1e3 * float(one.cant.sigma[j, 1]),
         }
-        for a, b, u, v in zip(design.cant.edges, design.cant.edges[1:], design.cant.start, design.cant.end, strict=False)
+        for j in range(len(c.start))
     ]  # fmt: skip
     return {
         "track": design.track,
@@ -208,10 +222,13 @@ def described(one: Fitted) -> dict[str, Any]:
             "white_m": float(np.mean(one.noise.sigma)),
             "correlated_m": one.noise.correlated,
             "correlation_length_m": one.noise.length if one.noise.correlated > 0.0 else None,
+            "smooth": one.noise.smooth,
         },
         "points_apart_m": one.resolution.spacing,
         "shortest_curve_m": one.shortest,
-        "law_margin": value(one.law_margin),
-        "next_best_law": one.law_second or None,
+        "law": one.law.said or None,
+        "law_probability": {KIND_NAMES[law]: p for law, p in one.law.probability.items()},
+        "law_from_points": one.law.told,
+        "settled": one.settled,
         "warnings": list(one.warnings),
     }

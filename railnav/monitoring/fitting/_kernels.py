@@ -21,10 +21,10 @@ _W = 0.5 * np.polynomial.legendre.leggauss(4)[1]
 @njit(cache=True)
 def _reset(
     x, P, old, new, order, prior, states
-):  # x (states + 1,), P alike; numbers of live states -> cost, changed in place
+):  # x (states + 2,), P alike; numbers of live states -> cost, changed in place
     """Pass from one kind of element to another: what is continuous stays, what jumps is drawn anew, eq (6)."""
     cost = 0.0
-    size = states + 1
+    size = states + 2
     for k in range(new, min(order, old)):  # continuous, and zero in the new element: condition on it
         s = P[k, k] + 1e-24
         cost += x[k] * x[k] / s + math.log(s / (prior[k] + 1e-300))
@@ -47,18 +47,18 @@ def _reset(
 
 @njit(cache=True)
 def segment(
-    step, y, shift, turn, bow, white, decay, colour, sites, first, rules, price, prior, beam, margin
+    step, y, shift, turn, bow, white, passing, colour, sites, first, rules, price, prior, beam, margin
 ):  # (n,) each; first (states, 2); rules (r, 3) -> (m, 3) int: sample, live states, order of the break
     """Cheapest sequence of elements through n measured values by a bank of Kalman filters, eqs (3) to (7).
 
-    States are the value and its derivatives along the track, the last state coloured noise. `step` (n,) from the sample before,
+    States are the value and its derivatives along the track, the last two coloured noise and its slope. `step` (n,) from the sample before,
     m; `y` (n,) measured; `shift`, `turn`, `bow` (n,): what the reference curve itself gains over the step in value and slope, and
-    its curvature; `white` (n,) variances; `decay` (n,), `colour`: coloured noise; `rules`: from live states, to live states,
-    lowest order that breaks; `price` (r,): of each.
+    its curvature; `white` (n,) variances; `passing` (n, 4), `colour` (2,): how coloured noise passes on and its
+    variances; `rules`: from live states, to live states, lowest order that breaks; `price` (r,): of each.
     """
     n = len(y)
     states = len(prior)
-    size = states + 1
+    size = states + 2
     most = beam * 2 + 64
     x = np.zeros((most, size))
     P = np.zeros((most, size, size))
@@ -76,7 +76,8 @@ def segment(
         for k in range(states):
             if k < a:
                 P[count, k, k] = prior[k]
-        P[count, states, states] = colour
+        P[count, states, states] = colour[0]
+        P[count, states + 1, states + 1] = colour[1]
         cost[count] = 0.0
         live[count] = a
         tree[nodes, 0] = -1
@@ -105,7 +106,8 @@ def segment(
                         term *= h / (q - p + 1)
                 if states > 1:
                     F[1, 0] -= bow[i] * bow[i] * h  # a parallel curve turns alike over a shorter way
-                F[states, states] = decay[i]
+                F[states, states], F[states, states + 1] = passing[i, 0], passing[i, 1]
+                F[states + 1, states], F[states + 1, states + 1] = passing[i, 2], passing[i, 3]
                 for p in range(size):
                     v = 0.0
                     for q in range(size):
@@ -127,7 +129,11 @@ def segment(
                         for m in range(size):
                             v += FP[p, m] * F[q, m]
                         P[c, p, q] = v
-                P[c, states, states] += colour * (1.0 - decay[i] * decay[i])
+                for p in range(2):  # what it gains keeps it as large as it is: P = F P F' + Q
+                    for q in range(2):
+                        kept_ = passing[i, 2 * p] * passing[i, 2 * q] * colour[0]
+                        kept_ += passing[i, 2 * p + 1] * passing[i, 2 * q + 1] * colour[1]
+                        P[c, states + p, states + q] += (colour[p] if p == q else 0.0) - kept_
             nu = y[i] - x[c, 0] - x[c, states]
             s = P[c, 0, 0] + 2.0 * P[c, 0, states] + P[c, states, states] + white[i]
             ratio = nu * nu / s
@@ -369,3 +375,72 @@ def advance(
         while s[i] > length[owner[i]] and owner[i] < last:
             s[i] -= length[owner[i]]
             owner[i] += 1
+
+
+@njit(cache=True)
+def products(design):  # (n, p) -> (p, p)
+    """Sums of products of the columns of a design whose rows are mostly zero; small, so that threads do not pay."""
+    n, p = design.shape
+    out = np.zeros((p, p))
+    here = np.empty(p, np.int64)
+    for i in range(n):
+        count = 0
+        for a in range(p):
+            if design[i, a] != 0.0:
+                here[count] = a
+                count += 1
+        for a in range(count):
+            for b in range(a + 1):
+                out[here[a], here[b]] += design[i, here[a]] * design[i, here[b]]
+    for a in range(p):
+        for b in range(a):
+            out[b, a] = out[a, b]
+    return out
+
+
+@njit(cache=True)
+def decompose(A):  # (n, n), changed in place -> pivots (n,), and whether it is regular
+    """LU decomposition with row pivots."""
+    n = len(A)
+    pivot = np.empty(n, np.int64)
+    for k in range(n):
+        best, at = -1.0, k
+        for i in range(k, n):
+            if abs(A[i, k]) > best:
+                best, at = abs(A[i, k]), i
+        pivot[k] = at
+        if not best > 1e-300:
+            return pivot, False
+        if at != k:
+            for j in range(n):
+                A[k, j], A[at, j] = A[at, j], A[k, j]
+        for i in range(k + 1, n):
+            if A[i, k] != 0.0:
+                A[i, k] /= A[k, k]
+                factor = A[i, k]
+                for j in range(k + 1, n):
+                    A[i, j] -= factor * A[k, j]
+    return pivot, True
+
+
+@njit(cache=True)
+def back(LU, pivot, right):  # (n, n), (n,), (n, q) -> (n, q)
+    """Solve the decomposed equations."""
+    x = right.copy()
+    n, q = x.shape
+    for c in range(q):
+        for k in range(n):
+            at = pivot[k]
+            if at != k:
+                x[k, c], x[at, c] = x[at, c], x[k, c]
+        for i in range(n):
+            v = x[i, c]
+            for j in range(i):
+                v -= LU[i, j] * x[j, c]
+            x[i, c] = v
+        for i in range(n - 1, -1, -1):
+            v = x[i, c]
+            for j in range(i + 1, n):
+                v -= LU[i, j] * x[j, c]
+            x[i, c] = v / LU[i, i]
+    return x

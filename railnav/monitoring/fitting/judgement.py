@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from railnav.monitoring.fitting.plan import ROBUST, Chain, PlanFit
+from railnav.monitoring.fitting.plan import Chain, PlanFit
 from railnav.track import elements
 
 FloatArray = NDArray[np.float64]
@@ -22,6 +22,8 @@ IntArray = NDArray[np.int64]
 NOTHING = 3.0
 #: A transition that bends the other way over less than this share of it does not.
 _HARDLY = 0.03
+#: Arcs less bent than this, 1/m, are not built, and what that weighs in -2 log likelihood.
+_WIDEST, _ODD = 1.0 / 40_000.0, 12.0
 #: A transition is none within this many sigmas of its length.
 _NO_LENGTH = 2.0
 
@@ -142,7 +144,7 @@ def split_inflections(items: list[Item]) -> list[Item]:
 
 
 def simplifications(
-    items: list[Item], bend_sigma: FloatArray, length_sigma: FloatArray, *, least: float = 0.5
+    items: list[Item], bend_sigma: FloatArray, length_sigma: FloatArray, *, least: float = 0.5, jump: float = 0.0
 ) -> list[Edit]:
     """Edits that leave out what the points do not speak for; none overlaps another.
 
@@ -155,25 +157,24 @@ def simplifications(
         m.
     least : float
         Shorter elements are none, m.
+    jump : float
+        How much rarer curvature jumps than it runs on, in -2 log likelihood: a transition that may well be none weighs as little of
+        that as it is shorter than its sigma.
     """
     edits: list[Edit] = []
     free = 0
     for j, item in enumerate(items):
         before = items[j - 1] if j > 0 else None
-        after = items[j + 1] if j + 1 < len(items) else None
         lo = j - 1 if before is not None else j
         if lo < free:
             continue
         edit = _without(items, j, bend_sigma, length_sigma, least)
+        if edit is not None and item.kind >= elements.CLOTHOID and edit.fewer == 1 and len(edit.items) == 2:
+            known = item.length / max(_NO_LENGTH * float(length_sigma[j]), least, 1e-9)
+            edit = replace(edit, bonus=-jump * min(known, 1.0))
         if edit is None and item.kind == elements.ARC and abs(item.k0) < NOTHING * bend_sigma[j]:
-            changed = [replace(item, kind=elements.STRAIGHT, k0=0.0, k1=0.0)]
-            if before is not None:
-                tied = before.kind >= elements.CLOTHOID and item.smooth
-                changed.insert(0, replace(before, k1=0.0) if tied else before)
-            if after is not None:
-                tied = after.kind >= elements.CLOTHOID and after.smooth
-                changed.append(replace(after, k0=0.0) if tied else after)
-            edit = Edit(lo, lo + len(changed), tuple(changed), 1)
+            changed = _straightened(items, j)
+            edit = Edit(lo, lo + len(changed), changed, 1)
         if edit is not None and edit.first >= free:
             edits.append(edit)
             free = edit.last
@@ -259,12 +260,40 @@ def with_law(chain: Chain, law: int | IntArray) -> Chain:
 
 @dataclass(frozen=True, slots=True)
 class Edit:
-    """A change to try: the elements from `first` to before `last` become `items`, with `fewer` unknowns."""
+    """A change to try: the elements from `first` to before `last` become `items`, with `fewer` unknowns.
+
+    `bonus` is by how much railways build the new elements rather than the old ones, in -2 log likelihood.
+    """
 
     first: int
     last: int
     items: tuple[Item, ...]
     fewer: int
+    bonus: float = 0.0
+
+
+def hardly_bent(items: list[Item]) -> list[Edit]:
+    """Edits that make a straight of an arc wider than railways build."""
+    edits: list[Edit] = []
+    for j, item in enumerate(items):
+        lo, hi = max(j - 1, 0), min(j + 2, len(items))
+        if item.kind != elements.ARC or abs(item.k0) > _WIDEST or (edits and edits[-1].last > lo):
+            continue
+        edits.append(Edit(lo, hi, _straightened(items, j), 1, _ODD))
+    return edits
+
+
+def _straightened(items: list[Item], j: int) -> tuple[Item, ...]:
+    """Element j, an arc, as a straight, and its neighbours."""
+    item = items[j]
+    changed = [replace(item, kind=elements.STRAIGHT, k0=0.0, k1=0.0)]
+    if j > 0:
+        tied = items[j - 1].kind >= elements.CLOTHOID and item.smooth
+        changed.insert(0, replace(items[j - 1], k1=0.0) if tied else items[j - 1])
+    if j + 1 < len(items):
+        tied = items[j + 1].kind >= elements.CLOTHOID and items[j + 1].smooth
+        changed.append(replace(items[j + 1], k0=0.0) if tied else items[j + 1])
+    return tuple(changed)
 
 
 def smooth_joints(items: list[Item]) -> list[Edit]:
@@ -333,28 +362,63 @@ def plain_transitions(items: list[Item]) -> list[Edit]:
     return edits
 
 
+#: Arcs shorter than this share of a run may be part of a transition, and a run has at most so many elements.
+_SHORT_ARC, _LONGEST_RUN = 0.4, 7
+
+
 def joined_runs(items: list[Item]) -> list[Edit]:
-    """Edits that make one transition of several that follow each other and bend further all the time."""
-    edits = []
-    j = 0
-    while j < len(items):
-        if items[j].kind < elements.CLOTHOID:
-            j += 1
+    """Edits that make one transition of several elements that bend further all the time, short arcs among them.
+
+    A law that is not the clothoid's comes out of clothoids and arcs as several.
+    """
+    edits: list[Edit] = []
+    at = 0
+    while at < len(items):
+        best = None
+        for end in range(at + 2, min(at + _LONGEST_RUN, len(items)) + 1):
+            if end < len(items) and items[end].kind >= elements.CLOTHOID and items[end].smooth and items[end].k0 != 0.0:
+                continue  # a run ends at a plain element, where the track is straight, or with the track
+            if _one_transition(items, at, end):
+                best = end
+        if best is None:
+            at += 1
             continue
-        end = j + 1
-        while end < len(items) and items[end].kind >= elements.CLOTHOID and items[end].smooth:
-            if items[end].k0 == 0.0:  # a point of inflection parts them
-                break
-            rates = [item.k1 - item.k0 for item in items[j : end + 1]]
-            if min(rates) < 0.0 < max(rates):
-                break
-            end += 1
-        if end - j > 1:
-            run = items[j:end]
-            one = replace(run[0], length=sum(item.length for item in run), k1=run[-1].k1)
-            edits.append(Edit(j, end, (one,), 2 * (end - j - 1)))
-        j = end
+        run = items[at:best]
+        before = items[at - 1] if at > 0 else None
+        after = items[best] if best < len(items) else None
+        k0 = before.k1 if before is not None and before.kind < elements.CLOTHOID else run[0].k0
+        k1 = after.k0 if after is not None and after.kind < elements.CLOTHOID else run[-1].k1
+        one = replace(run[0], kind=elements.CLOTHOID, length=sum(item.length for item in run), k0=k0, k1=k1)
+        new = [replace(one, smooth=before is not None)]
+        if after is not None:
+            new.append(replace(after, smooth=True))
+        unknown = sum(2 if item.kind == elements.ARC else 1 for item in run) + sum(
+            item.kind >= elements.CLOTHOID and not item.smooth for item in run
+        )
+        edits.append(Edit(at, best + len(new) - 1, tuple(new), max(unknown - 1, 1)))
+        at = best + len(new) - 1
     return edits
+
+
+def _one_transition(items: list[Item], begin: int, end: int) -> bool:
+    """Whether the elements from `begin` to before `end` could be one transition."""
+    run = items[begin:end]
+    total = sum(item.length for item in run)
+    if not any(item.kind >= elements.CLOTHOID for item in run):
+        return False
+    if any(item.kind == elements.STRAIGHT for item in run):
+        return False
+    if any(item.kind == elements.ARC and item.length > _SHORT_ARC * total for item in run):
+        return False
+    bends = [value for item in run for value in (item.k0, item.k1)]
+    if begin > 0:
+        bends.insert(0, items[begin - 1].k1)
+    if end < len(items):
+        bends.append(items[end].k0)
+    steps = np.diff(bends)
+    if bends[0] * bends[-1] < 0.0:  # curves to both sides meet where the track is straight
+        return False
+    return bool((steps >= -1e-12).all() or (steps <= 1e-12).all())
 
 
 def applied(items: list[Item], edits: list[Edit]) -> list[Item]:
@@ -370,6 +434,5 @@ def applied(items: list[Item], edits: list[Edit]) -> list[Item]:
 
 def squares_between(fit: PlanFit, low: FloatArray, high: FloatArray) -> FloatArray:
     """Weighted squares of the points between places along the axis, (k,)."""
-    ratio = np.abs(fit.residual) / fit.sigma
-    square = np.append(0.0, np.cumsum(np.where(ratio > ROBUST, ROBUST * (2.0 * ratio - ROBUST), ratio**2)))
+    square = np.append(0.0, np.cumsum(fit.square))
     return np.asarray(square[np.searchsorted(fit.along, high)] - square[np.searchsorted(fit.along, low)])

@@ -24,6 +24,12 @@ _FOURTH = 70.0
 _STILL_SMOOTH = 2.5
 #: Smoothed points are taken so far apart that they differ by this share of their stated sigma.
 _SHARE = 0.25
+#: Spacing up to which points are thinned, m: those of a model, whose errors are known to be smooth, not past its transitions.
+_FARTHEST, _FARTHEST_SMOOTH = 200.0, 32.0
+#: Errors of smoothed points: shares of what they state, lengths in m, and white noise as a share of the waves that are tried.
+_SHARES = (0.5, 1.0, 2.0)
+_LENGTHS = (25.0, 50.0, 100.0, 200.0, 400.0, 800.0)
+_WHITES = (0.003, 0.01, 0.03, 0.1)
 #: Samples on which the waves of the noise are judged.
 _JUDGED = 1200
 #: Steps of the search for waves, in logarithms, and how many noises are tried.
@@ -92,7 +98,7 @@ def resolution(
     every = 1
     while (
         2 * every * 24 < count
-        and 2 * every * spacing <= 200.0
+        and 2 * every * spacing <= (_FARTHEST if stated is None else _FARTHEST_SMOOTH)
         and (sigma(2 * every) > _STILL_SMOOTH * sigma(every) or (stated is not None and sigma(every) < 0.1 * floor))
         and (sigma(2 * every) > floor if stated is None else sigma(every) < _SHARE * stated)
     ):
@@ -127,15 +133,7 @@ def likeliest(
     largest : float
         Waves may be as large as this in any case: what smoothed points state of themselves, m.
     """
-    if count <= _JUDGED:
-        stretches = [slice(0, count)]
-    else:
-        third = _JUDGED // 3
-        stretches = [slice(a, a + third) for a in np.linspace(0, count - third, 3).astype(int).tolist()]
-
-    def cost(noise: Noise) -> float:
-        white = float(np.mean(noise.sigma))
-        return sum(pieces(noise, p).cost + (p.stop - p.start) * 2.0 * float(np.log(white)) for p in stretches)
+    cost = _cost_of(pieces, count)
 
     def noise_of(place: tuple[float, float, float]) -> Noise:
         """From logarithms: white noise, growth of the waves over one spacing, their length."""
@@ -178,3 +176,67 @@ def likeliest(
     if known[place] < least_plain - _WORTH:
         return noise_of(place)
     return plain
+
+
+def likeliest_smooth(
+    pieces: Callable[[Noise, slice], Pieces], count: int, size: float, *, floor: float, stated: float | None = None
+) -> Noise:
+    """Noise of points that come from smoothing: waves with a slope, about as large as the points state.
+
+    Their length, size and the white rest are those under which the points, elements and all, are likeliest.
+
+    Parameters
+    ----------
+    pieces : callable
+        From a noise and a stretch of samples to its pieces and their cost.
+    count : int
+        Samples.
+    size : float
+        Sigma that the points state, m.
+    floor : float
+        Least white noise, m.
+    stated : float, optional
+        White noise that the user states, m.
+    """
+    cost = _cost_of(pieces, count)
+
+    def noise_of(place: tuple[int, int, int]) -> Noise:
+        waves = size * _SHARES[place[0]]
+        return Noise(
+            max(_WHITES[place[2]] * size, floor) if stated is None else stated, waves, _LENGTHS[place[1]], True
+        )
+
+    most = (len(_SHARES), len(_LENGTHS), len(_WHITES) if stated is None else 1)
+    place = (1, 2, min(1, most[2] - 1))
+    known = {place: cost(noise_of(place))}
+    moved = True
+    while moved:
+        moved = False
+        for axis in (1, 2, 0):
+            for sense in (1, -1):
+                while True:
+                    there = tuple(v + sense * (k == axis) for k, v in enumerate(place))
+                    if not 0 <= there[axis] < most[axis]:
+                        break
+                    trial = (there[0], there[1], there[2])
+                    if trial not in known:
+                        known[trial] = cost(noise_of(trial))
+                    if known[trial] >= known[place] - 0.5:
+                        break
+                    place, moved = trial, True
+    return noise_of(place)
+
+
+def _cost_of(pieces: Callable[[Noise, slice], Pieces], count: int) -> Callable[[Noise], float]:
+    """-2 log likelihood of the points under a noise, on some stretches of a long track."""
+    if count <= _JUDGED:
+        stretches = [slice(0, count)]
+    else:
+        third = _JUDGED // 3
+        stretches = [slice(a, a + third) for a in np.linspace(0, count - third, 3).astype(int).tolist()]
+
+    def cost(noise: Noise) -> float:
+        white = float(np.mean(noise.sigma))
+        return sum(pieces(noise, p).cost + (p.stop - p.start) * 2.0 * float(np.log(white)) for p in stretches)
+
+    return cost

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from railnav.errors import EstimationError
 from railnav.monitoring.fitting import _kernels
-from railnav.monitoring.fitting.segmentation import ARC, STRAIGHT, Pieces
+from railnav.monitoring.fitting.segmentation import ARC, STRAIGHT, Noise, Pieces
+from railnav.monitoring.fitting.waves import Waves
 from railnav.track import elements
 from railnav.track.elements import Plan
 
@@ -28,17 +29,25 @@ IntArray = NDArray[np.int64]
 ROBUST = 3.5
 #: Unknowns of an element: easting, northing, bearing of its start, its length.
 _OWN = 4
-_MOST_STEPS = 40
-#: Lengths settle within this, m.
-_SETTLED = 2e-4
+_MOST_STEPS, _MOST_TRIALS = 40, 9
+#: Steps that would lower the sum of squares by no more than this, and leave elements apart by no more than that, m, are at rest.
+_AT_REST, _CLOSED = 1e-2, 1e-7
+#: No element gets shorter than this, m.
+_LEAST_LENGTH = 0.02
 #: How far elements may miss each other on the way, sigmas of the points, and the length over which a miss of direction counts, m.
-_APART, _ARM = 2.0, 20.0
-#: Share of what points tell that every unknown is held with.
-_TRACE = np.array([1e-10, 1e-10, 1e-10, 1e-9])
+_APART, _ARM = 0.1, 20.0
+#: A length that the points do not tell is held as if it were known to this, m, a curvature to this, 1/m.
+_HARDLY_LENGTH, _HARDLY_BEND = 300.0, 0.1
+#: Damping of one holds a length to its own size and a curvature to its own, at least this, 1/m.
+_BEND_SIZE = 1e-3
 #: No track bends more than this, 1/m.
 _SHARPEST = 0.2
 #: A length changes by no more than this share in a step.
 _STRIDE = 0.5
+_LEAST_DAMPING = 1e-9
+#: Equations of fewer unknowns are solved dense.
+_SMALL = 220
+_UNDETERMINED = "the elements are not determined by the points; fewer elements, or points further along, would do"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,27 +125,27 @@ class PlanFit:
         Lengths of their feet from the start of the axis, m.
     weight : (n,) array
         Robust weights, 1 for points that fit.
+    square : (n,) array
+        What each point, and the wave that leads to it, add to the cost.
     cost : float
-        Weighted sum of squares.
+        -2 log likelihood of the points but for a constant: Huber's sum of their squares and those of the waves.
     settled : bool
         Whether the steps came to rest.
-    design : sparse array (n, p)
-        d(residual)/d(unknowns), whitened.
-    factor : SuperLU
+    factor : Factored
         Of the normal equations with their conditions.
-    sigma : (n,) array
-        Sigmas of the points, as used, m.
+    noise : Noise
+        Of the points, as used.
     """
 
     chain: Chain
     residual: FloatArray
     along: FloatArray
     weight: FloatArray
+    square: FloatArray
     cost: float
     settled: bool
-    design: object
-    factor: object
-    sigma: FloatArray
+    factor: Factored
+    noise: Noise
 
 
 def chain_of_pieces(pieces: Pieces, along: FloatArray, ref: tuple[FloatArray, ...]) -> Chain:
@@ -178,7 +187,7 @@ def fit_plan(
     along: FloatArray,
     east: FloatArray,
     north: FloatArray,
-    sigma: FloatArray,
+    noise: Noise,
     *,
     steps: int = _MOST_STEPS,
     held: NDArray[np.bool_] | None = None,
@@ -193,8 +202,8 @@ def fit_plan(
         Lengths along the chain where the feet of the points about lie, m.
     east, north : (n,) array
         Points in order, m.
-    sigma : (n,) array
-        Of the points across the track, m.
+    noise : Noise
+        Of the points across the track.
     steps : int
         At most.
     held : (m + c,) bool array, optional
@@ -220,52 +229,59 @@ def fit_plan(
     edges = chain.edges
     owner = np.clip(np.searchsorted(edges, along, side="right") - 1, 0, m - 1).astype(np.int64)
     s = along - edges[owner]
+    sigma = np.broadcast_to(np.asarray(noise.sigma, np.float64), (len(x),))
+    waves = Waves(along, noise)
     robust = np.ones(len(x))
     state = _lay(chain, owner, s)
     for _ in range(3):
         owner, s = _feet(chain, owner, s, x, y, state)
         state = _lay(chain, owner, s)
-    damping, merit = 1e-5, _merit(chain, x, y, sigma, state)
+    wave, merit = _merit(chain, x, y, sigma, robust, waves, state)
+    count_of = _OWN * m + len(chain.bend)
+    damping, grow = merit / (_OWN * m), 2.0  # a poor start asks for short steps
     for count in range(steps):
-        given = partial(_equations, chain, owner, s, x, y, sigma, robust, state)
-        count_of = _OWN * m + len(chain.bend)
-        step, damping = _step_of(given, held, damping, count_of, chain.length)
+        given = partial(_equations, chain, owner, s, x, y, sigma, robust, waves, wave, state)
         end = s[-1] if owner[-1] == m - 1 else None
-        for _ in range(7):  # a step that leads away is taken again, shorter
-            trial, moved = _stepped(chain, step, end)
-            if not _lawful(trial, reach):
-                damping = max(damping * 10.0, 1e-4)
-                step, damping = _step_of(given, held, damping, count_of, chain.length)
-                trial, moved = chain, 0.0
-                trial_owner, trial_s, trial_state, trial_merit = owner, s, state, merit
-                continue
-            trial_owner, trial_s = _refooted(chain, trial, owner, s)
-            trial_state = _lay(trial, trial_owner, trial_s)
-            trial_owner, trial_s = _feet(trial, trial_owner, trial_s, x, y, trial_state)
-            trial_state = _lay(trial, trial_owner, trial_s)
-            trial_merit = _merit(trial, x, y, sigma, trial_state)
-            if trial_merit <= merit * (1.0 + 1e-9) + 1e-6 or count == 0:
-                damping = max(damping * 0.2, 1e-9)
-                break
-            damping = max(damping * 10.0, 1e-4)
-            step, damping = _step_of(given, held, damping, count_of, chain.length)
-        gained = merit - trial_merit
-        chain, owner, s, state, merit = trial, trial_owner, trial_s, trial_state, trial_merit
-        residual = _across(x, y, state)
-        ratio = np.abs(residual) / sigma
+        for _ in range(_MOST_TRIALS):  # a step that leads away is taken again, shorter
+            step, damping, promised, solver = _step_of(given, held, damping, count_of, chain.length)
+            trial = _closed(_stepped(chain, step, end), solver, count_of, waves.count)
+            if _lawful(trial, reach):
+                trial_owner, trial_s = _refooted(chain, trial, owner, s)
+                trial_state = _lay(trial, trial_owner, trial_s)
+                trial_owner, trial_s = _feet(trial, trial_owner, trial_s, x, y, trial_state)
+                trial_state = _lay(trial, trial_owner, trial_s)
+                trial_wave, trial_merit = _merit(trial, x, y, sigma, robust, waves, trial_state)
+                if trial_merit <= merit + 0.1 * _AT_REST or (count == 0 and trial_merit < 3.0 * merit):
+                    share = (merit - trial_merit) / max(promised, 1e-30)
+                    damping = max(damping * max(0.1, 1.0 - (2.0 * min(share, 1.0) - 1.0) ** 3), _LEAST_DAMPING)
+                    grow = 2.0
+                    chain, owner, s, state, merit = trial, trial_owner, trial_s, trial_state, trial_merit
+                    wave = trial_wave
+                    break
+            damping, grow = max(damping * grow, 1e-4), 2.0 * grow
+        else:
+            settled = promised < 1.0 and _apart(chain, state) < _CLOSED  # nothing better nearby
+            break
+        ratio = np.abs(_across(x, y, state) - waves.at(wave)) / sigma
         robust = np.where(ratio > ROBUST, ROBUST / np.maximum(ratio, ROBUST), 1.0)
-        if count > 1 and (moved < _SETTLED or abs(gained) < 1e-5 * max(merit, 1.0)):
+        wave, merit = _merit(chain, x, y, sigma, robust, waves, state)
+        if count > 1 and promised < _AT_REST and _apart(chain, state) < _CLOSED:
             settled = True
             break
     for _ in range(3):
         owner, s = _feet(chain, owner, s, x, y, state)
         state = _lay(chain, owner, s)
-    residual, rows, kkt, _ = _equations(chain, owner, s, x, y, sigma, robust, state, 0.0, held)
-    cost = float(np.sum(robust * (residual / sigma) ** 2))
+    residual = _across(x, y, state)
+    wave, _ = _merit(chain, x, y, sigma, robust, waves, state)
+    _, kkt, _ = _equations(chain, owner, s, x, y, sigma, robust, waves, wave, state, 0.0, held)
+    square = _huber(residual - waves.at(wave), sigma) + waves.squares(wave)
     along = chain.edges[owner] + s
     start = chain.start.copy()
     start[:, :2] += origin
-    return PlanFit(replace(chain, start=start), residual, along, robust, cost, settled, rows, _factor(kkt), sigma)
+    factor = factored(kkt, count_of + waves.count)
+    return PlanFit(
+        replace(chain, start=start), residual, along, robust, square, float(square.sum()), settled, factor, noise
+    )
 
 
 # --- within -----------------------------------------------------------------------------------------------------------
@@ -326,12 +342,14 @@ def _equations(
     y: FloatArray,
     sigma: FloatArray,
     robust: FloatArray,
+    waves: Waves,
+    wave: FloatArray,
     state: tuple[FloatArray, ...],
     damping: float = 0.0,
     held: NDArray[np.bool_] | None = None,
     change: FloatArray | None = None,
-) -> tuple[FloatArray, object, object, FloatArray]:
-    """Residuals, whitened design, and the normal equations with their conditions, eq (10)."""
+) -> tuple[Any, Any, FloatArray]:
+    """Whitened design, and the normal equations with their conditions, eq (10): elements first, then waves, then conditions."""
     from scipy import sparse
 
     here, slopes, ends, end_slopes = state
@@ -349,16 +367,23 @@ def _equations(
     keep += [chain.first[owner] >= 0, chain.last[owner] >= 0]
     row = np.arange(n)
     weight = np.sqrt(robust) / sigma
-    design = sparse.csr_array(
-        (
-            np.concatenate([(-b * weight)[k] for b, k in zip(by, keep, strict=True)]),
-            (
-                np.concatenate([row[k] for k in keep]),
-                np.concatenate([column[k] for column, k in zip(columns, keep, strict=True)]),
-            ),
-        ),
-        shape=(n, p),
+    whole = p + waves.count
+    small = whole + 3 * m < _SMALL
+    design = _filled(
+        np.concatenate([(-b * weight)[k] for b, k in zip(by, keep, strict=True)]),
+        np.concatenate([row[k] for k in keep]),
+        np.concatenate([column[k] for column, k in zip(columns, keep, strict=True)]),
+        (n, p),
+        small,
     )
+    misfit = weight * residual
+    if waves.count:
+        through = -(sparse.diags_array(weight) @ waves.pick)
+        if small:
+            design = np.block([[design, through.toarray()], [np.zeros((waves.count, p)), waves.steps.toarray()]])
+        else:
+            design = sparse.block_array([[design, through], [None, waves.steps]], format="csr")
+        misfit = np.concatenate([misfit - weight * waves.at(wave), waves.steps @ wave])
     # conditions: the end of element j is the start of j + 1
     j = np.arange(m - 1)
     sb, cb = np.sin(ends[:-1, 2]), np.cos(ends[:-1, 2])
@@ -410,14 +435,30 @@ def _equations(
             (np.zeros(len(stay)) if change is None else change[stay]),
         ]
     )
-    conditions = sparse.csr_array(
-        (np.concatenate(data), (np.concatenate(rows), np.concatenate(cols))), shape=(3 * (m - 1) + 2 + len(stay), p)
+    conditions = _filled(
+        np.concatenate(data),
+        np.concatenate(rows),
+        np.concatenate(cols),
+        (3 * (m - 1) + 2 + len(stay), whole),
+        small,
     )
-    normal = design.T @ design
-    scale = _damping(chain, normal.diagonal()) + damping * normal.diagonal()
-    kkt = sparse.block_array([[normal + sparse.diags_array(scale), conditions.T], [conditions, None]], format="csc")
-    rhs = np.concatenate([-(design.T @ (weight * residual)), rest])
-    return residual, design, kkt, rhs
+    normal = _kernels.products(design) if small else design.T @ design
+    scale = np.append(_hold(chain, damping), np.zeros(waves.count))
+    if small:
+        nothing = np.zeros((len(conditions), len(conditions)))
+        kkt = np.block([[normal + np.diag(scale), conditions.T], [conditions, nothing]])
+    else:
+        kkt = sparse.block_array([[normal + sparse.diags_array(scale), conditions.T], [conditions, None]], format="csc")
+    return design, kkt, np.concatenate([-(design.T @ misfit), rest])
+
+
+def _filled(data: FloatArray, rows: IntArray, cols: IntArray, shape: tuple[int, int], small: bool) -> Any:
+    """A matrix of sums at rows and columns: dense where it is small, which is quicker, else sparse."""
+    from scipy import sparse
+
+    if small:
+        return np.bincount(rows * shape[1] + cols, data, shape[0] * shape[1]).reshape(shape)
+    return sparse.csr_array((data, (rows, cols)), shape=shape)
 
 
 def _lawful(chain: Chain, reach: float) -> bool:
@@ -432,16 +473,30 @@ def _across(x: FloatArray, y: FloatArray, state: tuple[FloatArray, ...]) -> Floa
     return np.asarray((x - here[:, 0]) * np.cos(here[:, 2]) - (y - here[:, 1]) * np.sin(here[:, 2]))
 
 
-def _merit(chain: Chain, x: FloatArray, y: FloatArray, sigma: FloatArray, state: tuple[FloatArray, ...]) -> float:
-    """What a step must not raise: Huber's sum over the points, and how far elements miss each other."""
-    ratio = np.abs(_across(x, y, state)) / sigma
-    points = np.where(ratio > ROBUST, ROBUST * (2.0 * ratio - ROBUST), ratio**2).sum()
+def _huber(off: FloatArray, sigma: FloatArray) -> FloatArray:
+    ratio = np.abs(off) / sigma
+    return np.asarray(np.where(ratio > ROBUST, ROBUST * (2.0 * ratio - ROBUST), ratio**2))
+
+
+def _merit(
+    chain: Chain,
+    x: FloatArray,
+    y: FloatArray,
+    sigma: FloatArray,
+    robust: FloatArray,
+    waves: Waves,
+    state: tuple[FloatArray, ...],
+) -> tuple[FloatArray, float]:
+    """Likeliest waves, and what a step must not raise: Huber's sum over the points, and how far elements miss each other."""
+    off = _across(x, y, state)
+    wave = waves.likeliest(off, robust / sigma**2)
+    points = _huber(off - waves.at(wave), sigma).sum() + waves.squares(wave).sum()
     ends = state[2]
     miss = chain.start[1:] - ends[:-1, :3]
     allowed = _APART * float(np.median(sigma))
     apart = (miss[:, 0] ** 2 + miss[:, 1] ** 2).sum() / allowed**2
     apart += (miss[:, 2] ** 2).sum() / (allowed / _ARM) ** 2
-    return float(points + apart)
+    return wave, float(points + apart)
 
 
 def _refooted(chain: Chain, trial: Chain, owner: IntArray, s: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -452,82 +507,152 @@ def _refooted(chain: Chain, trial: Chain, owner: IntArray, s: FloatArray) -> tup
     return found, total - edges[found]
 
 
-def _damping(chain: Chain, diagonal: FloatArray) -> FloatArray:
-    """A trace of weight on every unknown, so that what the points do not tell stays put: 1e-9 of what they tell of their kind."""
+def _hold(chain: Chain, damping: float) -> FloatArray:
+    """Weights that hold lengths and curvatures: a trace, so that what the points do not tell stays put, and the damping of a step.
+
+    Starts and directions need none: lengths, curvatures and the points settle them.
+    """
     m = len(chain.kind)
-    scale = np.zeros(len(diagonal))
-    own = diagonal[: _OWN * m].reshape(m, _OWN)
-    told = np.maximum(own.max(axis=0), 1e-30)
-    scale[: _OWN * m] = np.tile(_TRACE * told, m)
-    bends = diagonal[_OWN * m :]
-    if len(bends):
-        scale[_OWN * m :] = 1e-12 * max(float(bends.max()), 1e-30)
+    scale = np.zeros(_OWN * m + len(chain.bend))
+    scale[_OWN - 1 : _OWN * m : _OWN] = _HARDLY_LENGTH**-2 + damping * np.maximum(chain.length, 1.0) ** -2
+    scale[_OWN * m :] = _HARDLY_BEND**-2 + damping * np.maximum(np.abs(chain.bend), _BEND_SIZE) ** -2
     return scale
 
 
-def _factor(kkt: object) -> object:
+@dataclass(frozen=True, slots=True, eq=False)
+class Factored:
+    """Equations with conditions, factored with rows and columns of like size: what a radius and a place tell differ by 1e12."""
+
+    lu: Any
+    scale: FloatArray
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Of the equations."""
+        return (len(self.scale), len(self.scale))
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Solutions of right sides (p,) or (p, q)."""
+        by = self.scale if right.ndim == 1 else self.scale[:, None]
+        if isinstance(self.lu, tuple):
+            found = np.asarray(by * _kernels.back(*self.lu, (by * right).reshape(len(right), -1)).reshape(right.shape))
+        else:
+            found = np.asarray(by * self.lu.solve(by * right))
+        if not np.isfinite(found).all():
+            raise EstimationError(_UNDETERMINED)
+        return found
+
+
+def factored(kkt: Any, unknowns: int) -> Factored:
+    """Factor equations of so many unknowns and then conditions.
+
+    Raises
+    ------
+    EstimationError
+        They have no unique solution.
+    """
+    from scipy import sparse
     from scipy.sparse.linalg import splu
 
+    scale = np.ones(kkt.shape[0])
+    scale[:unknowns] = np.minimum(np.maximum(kkt.diagonal()[:unknowns], 1e-30) ** -0.5, 1.0)
+    if isinstance(kkt, np.ndarray):
+        scale[unknowns:] = 1.0 / np.maximum(np.abs(kkt[unknowns:, :unknowns] * scale[:unknowns]).max(axis=1), 1e-30)
+        scaled = scale[:, None] * kkt * scale
+        pivot, regular = _kernels.decompose(scaled)
+        if not regular or not np.isfinite(scaled).all():
+            raise EstimationError(_UNDETERMINED)
+        return Factored((scaled, pivot), scale)
+    size = np.abs(kkt[unknowns:, :unknowns] @ sparse.diags_array(scale[:unknowns])).max(axis=1).toarray().ravel()
+    scale[unknowns:] = 1.0 / np.maximum(size, 1e-30)
+    by = sparse.diags_array(scale)
     try:
-        return splu(kkt)
+        return Factored(splu((by @ kkt @ by).tocsc()), scale)
     except RuntimeError as error:
-        raise EstimationError(
-            "the elements are not determined by the points; fewer elements, or points further along, would do"
-        ) from error
+        raise EstimationError(_UNDETERMINED) from error
 
 
 def _step_of(
-    equations: Callable[..., tuple[Any, Any, Any, FloatArray]],
+    equations: Callable[..., tuple[Any, Any, FloatArray]],
     held: NDArray[np.bool_] | None,
     damping: float,
     count: int,
     length: FloatArray,
-) -> tuple[FloatArray, float]:
-    """Unknowns' step (count,) and the damping it took: equations without a solution are damped until they have one."""
+) -> tuple[FloatArray, float, float, Factored]:
+    """Unknowns' step (count,), the damping it took, by how much it promises to lower the sum of squares, and its equations.
+
+    Lengths that would change by too much, or become none, change by what they may; equations without a solution are damped until
+    they have one.
+    """
     m = len(length)
-    bound = _STRIDE * np.maximum(length, 0.5)
-    for _ in range(6):
-        _, _, kkt, rhs = equations(damping=damping, held=held)
+    least = np.minimum(np.maximum(-_STRIDE * np.maximum(length, 0.5), _LEAST_LENGTH - length), 0.0)
+    most = _STRIDE * np.maximum(length, 0.5)
+    for _ in range(7):
+        stays = np.zeros(m + (count - _OWN * m), bool) if held is None else held.copy()
+        change = np.zeros(len(stays))
         try:
-            step = _solve(kkt, rhs)[:count]
-            stays = np.zeros(m + (count - _OWN * m), bool) if held is None else held.copy()
-            change = np.zeros(len(stays))
-            for _ in range(3):  # lengths that would change too much change by what they may
+            for _ in range(4):
+                design, kkt, rhs = equations(damping=damping, held=stays, change=change)
+                solver = factored(kkt, design.shape[1])
+                step = solver.solve(rhs)[: design.shape[1]]
                 wanted = step[_OWN - 1 : _OWN * m : _OWN]
-                over = np.append((np.abs(wanted) > 1.0001 * bound)[:-1], False) & ~stays[:m]
+                over = (wanted < least - 1e-6) | (wanted > most + 1e-6)
+                over[-1] = False
+                over &= ~stays[:m]
                 if not over.any():
                     break
                 stays[:m] |= over
-                change[:m] = np.where(over, np.copysign(bound, wanted), change[:m])
-                _, _, kkt, rhs = equations(damping=damping, held=stays, change=change)
-                step = _solve(kkt, rhs)[:count]
+                change[:m] = np.where(over, np.clip(wanted, least, most), change[:m])
         except EstimationError:
-            damping = max(damping * 100.0, 1e-6)
+            damping = max(damping * 100.0, 1e-4)
         else:
-            return step, damping
+            gain = design @ step
+            promised = float(2.0 * (rhs[: len(step)] @ step) - gain @ gain)
+            return step, damping, abs(promised), solver
     raise EstimationError("the elements are not determined by the points; fewer elements would do")
 
 
-def _solve(kkt: object, rhs: FloatArray) -> FloatArray:
-    solution: FloatArray = _factor(kkt).solve(rhs)  # type: ignore[attr-defined]
-    if not np.isfinite(solution).all():
-        raise EstimationError("the elements are not determined by the points")
-    return solution
-
-
-def _stepped(chain: Chain, step: FloatArray, last: float | None) -> tuple[Chain, float]:
-    """The chain after a step, lengths bounded, and the largest change of a length."""
+def _stepped(chain: Chain, step: FloatArray, last: float | None) -> Chain:
+    """The chain after a step; the last element ends where the last foot is."""
     m = len(chain.kind)
     own = step[: _OWN * m].reshape(m, _OWN)
-    change = own[:, 3].copy()
-    change[-1] = 0.0
-    bound = _STRIDE * np.maximum(chain.length, 0.5)
-    share = min(1.0, float(np.min(bound / np.maximum(np.abs(change), 1e-30))))
-    share = max(share, 0.05)
-    new = np.maximum(chain.length + share * change, 0.02)
+    new = np.maximum(chain.length + np.append(own[:-1, 3], 0.0), _LEAST_LENGTH)
     if last is not None:
-        new[-1] = max(last, 0.02)
-    start = chain.start + share * own[:, :3]
-    moved = float(np.abs(new - chain.length)[:-1].max(initial=0.0))
-    moved = max(moved, float(np.abs(own[:, :2]).max()))
-    return replace(chain, length=new, start=start, bend=chain.bend + share * step[_OWN * m :]), moved
+        new[-1] = max(last, _LEAST_LENGTH)
+    return replace(
+        chain, length=new, start=chain.start + own[:, :3], bend=chain.bend + step[_OWN * m : _OWN * m + len(chain.bend)]
+    )
+
+
+def _closed(chain: Chain, solver: Factored, count: int, waves: int) -> Chain:
+    """The chain with what elements miss each other by after a step taken away, at least cost to the points."""
+    m = len(chain.kind)
+    if m < 2:
+        return chain
+    nowhere = np.empty(0, np.int64), np.empty(0)
+    state = _lay(chain, *nowhere)
+    for _ in range(2):
+        right = np.zeros(solver.shape[0])
+        right[count + waves : count + waves + 3 * (m - 1)] = (chain.start[1:] - state[2][:-1, :3]).ravel()
+        try:
+            step = solver.solve(right)[:count]
+        except EstimationError:
+            return chain
+        own = step[: _OWN * m].reshape(m, _OWN)
+        most = 0.2 * _STRIDE * np.maximum(chain.length, 0.5)
+        change = np.append(own[:-1, 3], 0.0)
+        if (np.abs(change) > most).any():
+            return chain  # too far for this
+        length = np.maximum(chain.length + change, _LEAST_LENGTH)
+        nearer = replace(chain, length=length, start=chain.start + own[:, :3], bend=chain.bend + step[_OWN * m :])
+        again = _lay(nearer, *nowhere)
+        if not _apart(nearer, again) < 0.5 * _apart(chain, state):
+            return chain
+        chain, state = nearer, again
+    return chain
+
+
+def _apart(chain: Chain, state: tuple[FloatArray, ...]) -> float:
+    """By how much elements miss each other at most, m; directions over `_ARM`."""
+    miss = np.abs(chain.start[1:] - state[2][:-1, :3])
+    return float(max(miss[:, :2].max(initial=0.0), _ARM * miss[:, 2].max(initial=0.0)))

@@ -42,24 +42,39 @@ def noise_of_points(design: Any, along: FloatArray, noise: Noise, sigma: FloatAr
             pooled, place = gather @ (sparse.diags_array(scale) @ design), along[::thin]
         else:
             pooled, place = sparse.diags_array(scale) @ design, along
-        common = _correlation(place, noise.length)
+        common = _correlation(place, noise)
         total = total + noise.correlated**2 * (pooled.T @ (common @ pooled))
     return total
 
 
-def _correlation(place: FloatArray, length: float) -> Any:
-    """exp(-|distance| / length) of places in order, sparse."""
+def _correlation(place: FloatArray, noise: Noise) -> Any:
+    """Correlation of waves at places in order, sparse."""
     from scipy import sparse
 
     n = len(place)
     step = max(float(np.median(np.diff(place))), 1e-9)
-    lags = min(n - 1, int(np.ceil(_REACH * length / step)))
+    lags = min(n - 1, int(np.ceil(_REACH * noise.length / step)))
     diagonals, offsets = [np.ones(n)], [0]
     for lag in range(1, lags + 1):
-        value = np.exp(-np.abs(place[lag:] - place[:-lag]) / length)
+        value = noise.correlation(place[lag:] - place[:-lag])
         diagonals += [value, value]
         offsets += [lag, -lag]
     return sparse.diags_array(diagonals, offsets=offsets, format="csr")
+
+
+def sigmas_of_elements(factor: Any, combinations: FloatArray | Any) -> FloatArray:
+    """Standard deviations of combinations (q, p) of unknowns of equations that weigh points by their whole noise."""
+    from scipy import sparse
+
+    rows = sparse.csr_array(combinations)
+    out = np.empty(rows.shape[0])
+    for begin in range(0, rows.shape[0], _CHUNK):
+        part = rows[begin : begin + _CHUNK].toarray()
+        right = np.zeros((factor.shape[0], len(part)))
+        right[: part.shape[1]] = part.T
+        solved = factor.solve(right)[: part.shape[1]].T
+        out[begin : begin + len(part)] = np.sqrt(np.maximum((part * solved).sum(axis=1), 0.0))
+    return out
 
 
 def sigmas(factor: Any, unknowns: int, combinations: FloatArray | Any, middle: Any) -> FloatArray:

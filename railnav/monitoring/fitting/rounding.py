@@ -81,4 +81,4 @@ def round_design(
     from dataclasses import replace
 
     start = replace(chain, bend=bend, length=length)
-    return fit_plan(start, fit.along, east, north, fit.sigma, held=held), count
+    return fit_plan(start, fit.along, east, north, fit.noise, held=held), count

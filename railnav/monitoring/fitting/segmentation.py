@@ -41,7 +41,7 @@ _PLAN_RULES = (
     (ARC, TRANSITION, 3, 0.0),
     (TRANSITION, STRAIGHT, 3, 0.0),
     (TRANSITION, ARC, 3, 0.0),
-    (TRANSITION, TRANSITION, 3, 0.0),
+    (TRANSITION, TRANSITION, 3, 6.0),
     (STRAIGHT, ARC, 2, _JUMP_PRICE),
     (ARC, STRAIGHT, 2, _JUMP_PRICE),
     (ARC, ARC, 2, _JUMP_PRICE),
@@ -54,7 +54,7 @@ _PROFILE_RULES = (
     (GRADE, CURVE, 2, 0.0),
     (CURVE, GRADE, 2, 0.0),
     (CURVE, CURVE, 2, 0.0),
-    (GRADE, GRADE, 1, _JUMP_PRICE),
+    (GRADE, GRADE, 1, 2.5 * _JUMP_PRICE),
 )
 _CANT_RULES = (
     (LEVEL, RAMP, 1, 0.0),
@@ -62,6 +62,58 @@ _CANT_RULES = (
     (RAMP, RAMP, 1, 0.0),
     (LEVEL, LEVEL, 0, 2 * _JUMP_PRICE),
 )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prices:
+    """What pieces of a plan cost, in -2 log likelihood: -2 ln of how often they are built.
+
+    Attributes
+    ----------
+    place : float
+        That a piece begins at a point at all.
+    of_rule : (12,) array
+        Which one follows which, and how.
+    """
+
+    place: float
+    of_rule: FloatArray
+
+
+#: As railways are built: curvature runs on, from a straight by a transition to an arc and back.
+RAILWAY = Prices(_PRICE, np.array([rule[3] for rule in _PLAN_RULES]))
+#: As tramways are: curvature jumps as often as not.
+TRAMWAY = Prices(_PRICE, np.array([2.0, 2.0, 1.0, 1.0, 8.0, 1.0, 2.0, 2.0, 12.0, 12.0, 12.0, 12.0]))
+#: Weight of what is built elsewhere beside what a track itself shows, pieces.
+_ELSEWHERE = 4.0
+_CHEAPEST, _DEAREST_PLACE = 5.0, 14.0
+
+
+def learnt(pieces: Pieces, count: int) -> Prices:
+    """What pieces cost on a track of `count` points that is built like these."""
+    first = np.array([rule[0] for rule in _PLAN_RULES])
+    seen = np.array(
+        [
+            np.sum((pieces.live[:-1] == a) & (pieces.live[1:] == b) & (pieces.order[1:] == order))
+            for a, b, order, _ in _PLAN_RULES
+        ],
+        np.float64,
+    )
+    usual = np.exp(-0.5 * RAILWAY.of_rule)
+    of_rule = np.empty(len(seen))
+    for kind in (STRAIGHT, ARC, TRANSITION):
+        here = first == kind
+        share = seen[here] + _ELSEWHERE * usual[here] / usual[here].sum()
+        of_rule[here] = -2.0 * np.log(share / share.sum())
+    place = float(np.clip(2.0 * np.log(count / max(len(pieces.begin), 2)), _CHEAPEST, _DEAREST_PLACE))
+    return Prices(place, of_rule)
+
+
+def rarity_of_jumps(prices: Prices) -> float:
+    """How much rarer straights and arcs meet with a jump than through a transition, in -2 log likelihood, 0 where they do not."""
+    jumps = [k for k, (a, b, order, _) in enumerate(_PLAN_RULES) if order == 2 and TRANSITION not in (a, b)]
+    smooth = [k for k, (a, b, order, _) in enumerate(_PLAN_RULES) if order == 3 and a != TRANSITION and b == TRANSITION]
+    return max(float(prices.of_rule[jumps].min() - prices.of_rule[smooth].mean()), 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,11 +140,55 @@ class Pieces:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Noise:
-    """Noise of a measured quantity: white of `sigma` (scalar or a value a sample), and correlated, exponentially over `length`, m."""
+    """Noise of a measured quantity: white, and waves.
+
+    Attributes
+    ----------
+    sigma : float or (n,) array
+        White noise, m.
+    correlated : float
+        Size of the waves, m.
+    length : float
+        Distance d over which they forget, m: their correlation is exp(-d / length), and (1 + a) exp(-a), a = sqrt(3) d / length,
+        where they are smooth.
+    smooth : bool
+        Whether they have a slope, as the errors of smoothed points do.
+    """
 
     sigma: FloatArray | float
     correlated: float = 0.0
     length: float = 1.0
+    smooth: bool = False
+
+    @property
+    def total(self) -> float:
+        """Of a point, m."""
+        return float(np.hypot(np.mean(self.sigma), self.correlated))
+
+    def scaled(self, factor: float) -> Noise:
+        """The same noise so many times as large."""
+        return Noise(float(np.mean(self.sigma)) * factor, self.correlated * factor, self.length, self.smooth)
+
+    def correlation(self, distance: FloatArray) -> FloatArray:
+        """Correlation of the waves over distances."""
+        if self.smooth:
+            a = np.sqrt(3.0) * np.abs(distance) / self.length
+            return np.asarray((1.0 + a) * np.exp(-a))
+        return np.exp(-np.abs(distance) / self.length)
+
+    def passing(self, step: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """How waves and their slope pass on over steps, (n, 4) row by row, and their variances, (2,)."""
+        variance = self.correlated**2
+        zero = np.zeros(len(step))
+        if not self.smooth:
+            return np.column_stack([np.exp(-step / self.length), zero, zero, zero]), np.array([variance, 0.0])
+        rate = np.sqrt(3.0) / self.length
+        a = rate * step
+        e = np.exp(-a)
+        return (
+            np.column_stack([(1.0 + a) * e, step * e, -rate * a * e, (1.0 - a) * e]),
+            np.array([variance, rate**2 * variance]),
+        )
 
 
 def reference(along: FloatArray, east: FloatArray, north: FloatArray, window: float) -> tuple[FloatArray, ...]:
@@ -145,6 +241,7 @@ def segment_plan(
     curvature_scale: float,
     rate_scale: float,
     beam: int = BEAM,
+    prices: Prices | None = None,
 ) -> Pieces:
     """Pieces of a plan.
 
@@ -164,6 +261,8 @@ def segment_plan(
         What curvatures (1/m) and their changes along the track (1/m^2) are like.
     beam : int
         Hypotheses that go on.
+    prices : Prices, optional
+        What pieces cost; by default as on railways.
     """
     ref_e, ref_n, bearing, _ = reference(along, east, north, window)
     sin, cos = np.sin(bearing), np.cos(bearing)
@@ -188,6 +287,7 @@ def segment_plan(
         np.array([1.0, 0.01, curvature_scale**2, rate_scale**2]),
         every,
         beam,
+        RAILWAY if prices is None else prices,
     )
 
 
@@ -247,20 +347,21 @@ def _run(
     prior: FloatArray,
     every: float,
     beam: int,
+    prices: Prices | None = None,
 ) -> Pieces:
     n = len(along)
     if n < 8:
         raise TrackError(f"{n} points are too few to find elements in; give at least 8")
     white = np.broadcast_to(np.asarray(noise.sigma, np.float64) ** 2, (n,)).copy()
     zero = np.zeros(1)
-    decay = np.append(0.0, np.exp(-step / noise.length))
+    passing, colour = noise.passing(np.append(0.0, step))
     if every > 0.0:
         slot = np.floor(along / every)
         sites = np.append(False, np.diff(slot) > 0)
     else:
         sites = np.ones(n, bool)
     table = np.array([rule[:3] for rule in rules], np.int64)
-    price = _PRICE + np.array([rule[3] for rule in rules])
+    price = _PRICE + np.array([rule[3] for rule in rules]) if prices is None else prices.place + prices.of_rule
     found, cost = _kernels.segment(
         np.append(zero, step),
         np.ascontiguousarray(y),
@@ -268,8 +369,8 @@ def _run(
         np.append(zero, turn),
         np.append(zero, bow),
         white,
-        decay,
-        noise.correlated**2,
+        passing,
+        colour,
         sites,
         first,
         table,
