@@ -20,7 +20,7 @@ from railnav.estimation.change import windows
 from railnav.estimation.gross_error import chi_square_limit
 from railnav.survey.changes import CLEAR, FEWEST_WINDOWS, WINDOW_LENGTH, WINDOW_NODES
 from railnav.survey.offsets import HOLD, robust_fit
-from railnav.survey.stored import digest
+from railnav.survey.stored import digest, section_records
 from railnav.track.model import TrackModel
 from railnav.track.records import AxisRecords, ModelRecords
 
@@ -231,10 +231,15 @@ def difference(old: TrackModel, new: TrackModel, *, spacing: float = 5.0, false_
         )
     records = old.records, new.records
     relation, warnings = _relation(old, new, records)
-    pairs, only_old, only_new = _pairs(old, new)
+    pairs, only_old, only_new = _pairs(old, new, records[1])
     if not pairs:
         raise ModelError("the models have no track in common", remedy=f"they must lie within {SAME_TRACK:.0f} m")
     points = [_compare(old, new, a, b, spacing) for a, b in pairs]
+    for (a, _), p in zip(pairs, points, strict=True):
+        if sum(a == other for other, _ in pairs) > 1:  # each of its parts where it is
+            known = np.isfinite(p["slew"])
+            p.update({k: v[known] for k, v in p.items() if isinstance(v, np.ndarray)})
+            p["P_slew"], p["P_lift"] = (tuple(v[known] for v in p[which]) for which in ("P_slew", "P_lift"))
     common = np.zeros(3)
     if relation != "update":
         common = _common(points)
@@ -244,7 +249,7 @@ def difference(old: TrackModel, new: TrackModel, *, spacing: float = 5.0, false_
         p["common_slew"] = p["normal"] @ common[:2]
         p["common_lift"] = np.full(len(p["offset"]), common[2])
         found = _moved(old, new, records, a, b, p, relation, common, false_alarm)
-        forgotten = _forgotten(new, relation, b, old, p)
+        forgotten = _forgotten(new, relation, a, b, old, p)
         if relation == "update":
             found = forgotten
         p["moved"] = np.zeros(len(p["offset"]), np.bool_)
@@ -308,7 +313,9 @@ def _runs(model: TrackModel) -> list[dict[str, Any]]:
     return build
 
 
-def _pairs(old: TrackModel, new: TrackModel) -> tuple[list[tuple[str, str]], tuple[str, ...], tuple[str, ...]]:
+def _pairs(
+    old: TrackModel, new: TrackModel, records: ModelRecords | None
+) -> tuple[list[tuple[str, str]], tuple[str, ...], tuple[str, ...]]:
     """Tracks that are the same: by name where they lie together, otherwise the nearest."""
     from scipy.spatial import cKDTree
 
@@ -331,8 +338,16 @@ def _pairs(old: TrackModel, new: TrackModel) -> tuple[list[tuple[str, str]], tup
             if score < least:
                 best, least = other, score
         if best is not None:
-            pairs.append((name, best))
-            taken.add(best)
+            parts = [best]
+            if records is not None and best not in old.track_id:  # parted since
+                parts = [
+                    part
+                    for part in records.sections(records.surveyed(best))
+                    if part == best
+                    or (part not in old.track_id and part in trees and (trees[part].query(at)[0] < 1.0).sum() > 1)
+                ]
+            pairs += [(name, part) for part in parts]
+            taken.update(parts)
     had = {a for a, _ in pairs}
     return (
         pairs,
@@ -436,7 +451,7 @@ def _moved(
             before, after = p[f"P_{which}"]
             p[f"sigma_{which}"] = np.sqrt(np.maximum(np.abs(before - after), LEAST_VARIANCE))
             continue
-        stored = [None if r is None else r.tracks.get(name) for r, name in zip(records, (a, b), strict=True)]
+        stored = [section_records(r, m, name) for r, m, name in zip(records, (old, new), (a, b), strict=True)]
         chains = [None if t is None else (t.across if coordinate == "across" else t.up) for t in stored]
         if stored[0] is not None and stored[1] is not None and chains[0] is not None and chains[1] is not None:
             out += _by_windows(old, new, a, b, stored, (chains[0], chains[1]), coordinate, common, false_alarm)
@@ -547,7 +562,9 @@ def _by_points(a: str, p: dict[str, Any], coordinate: str, which: str, false_ala
     return found
 
 
-def _forgotten(new: TrackModel, relation: str, b: str, old: TrackModel, p: dict[str, Any]) -> list[MovedStretch]:
+def _forgotten(
+    new: TrackModel, relation: str, a: str, b: str, old: TrackModel, p: dict[str, Any]
+) -> list[MovedStretch]:
     """What the updates between two models found moved, at offsets of the old one."""
     if relation != "update":
         return []
@@ -561,13 +578,19 @@ def _forgotten(new: TrackModel, relation: str, b: str, old: TrackModel, p: dict[
         for track in entry["tracks"]:
             if track["track"] != b:
                 continue
-            scale = float(p["offset"][-1]) / track["length_m"]
-            found += [
-                MovedStretch(
-                    b, c["coordinate"], c["from_m"] * scale, c["to_m"] * scale, sign * c["shift_m"], c["sigma_m"],
-                    c["statistic"], c["limit"], "update",
+            length = new.length(b)
+            for c in track["changes"]:
+                if c["verdict"] != "moved" or not len(p["offset"]):
+                    continue
+                there = new.at(b, np.clip(np.array([c["from_m"], c["to_m"]]) / track["length_m"], 0.0, 1.0) * length)
+                first, last = sorted(
+                    float(p["offset"][np.argmin(np.hypot(p["easting"] - e, p["northing"] - n))])
+                    for e, n in zip(there.easting, there.northing, strict=True)
                 )
-                for c in track["changes"]
-                if c["verdict"] == "moved"
-            ]  # fmt: skip
+                found.append(
+                    MovedStretch(
+                        a, c["coordinate"], first, last, sign * c["shift_m"], c["sigma_m"], c["statistic"], c["limit"],
+                        "update",
+                    )
+                )  # fmt: skip
     return found

@@ -472,15 +472,6 @@ def beside(t: Surveyed, ways: Sequence[Way]) -> BoolArray:
     return out
 
 
-def end_beyond(ways: Sequence[Way], fixes: Sequence[Fixes]) -> None:
-    """Say of fixes beyond the ends of tracks that they are there."""
-    for way in ways:
-        if any(tie is not None and tie.end is not None for tie in (way.start, way.finish)):
-            reason = fixes[way.run].reason
-            here = way.fixes[reason[way.fixes] == FAR]
-            reason[here] = BEYOND
-
-
 def told_ways(ways: Sequence[Way], fixes: Sequence[Fixes], extension: Extension | None) -> list[dict[str, Any]]:
     """The ways as JSON values, for the report of an update."""
     out = []

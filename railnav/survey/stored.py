@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,9 @@ from railnav.survey.report import Survey
 from railnav.survey.surveyed import Surveyed
 from railnav.survey.vertical import Heights
 from railnav.track.records import AxisRecords, Borders, ModelRecords, TrackRecords
+
+if TYPE_CHECKING:
+    from railnav.track.model import TrackModel
 
 FloatArray = NDArray[np.float64]
 
@@ -174,3 +177,35 @@ def _borders(
     A[T * B :, R * B :] = np.eye(C * B)
     mean = np.concatenate([np.zeros(T * B), offsets.receiver.ravel()])  # a track's own is counted from its estimate
     return keep_borders(tracks, receivers, mean, A @ offsets.joint @ A.T)
+
+
+def section_records(records: ModelRecords | None, model: TrackModel, section: str) -> TrackRecords | None:
+    """Records of one track of a model; where turnouts part a surveyed track, those of its nodes in the section."""
+    if records is None:
+        return None
+    of = records.surveyed(section)
+    whole = records.tracks.get(of)
+    if whole is None or of == section:
+        return whole
+    lengths = np.cumsum([0.0, *(model.length(name) for name in records.sections(of))])
+    place, N = records.sections(of).index(section), len(whole.easting)
+    a, b = (int(v) for v in np.rint(lengths[place : place + 2] / lengths[-1] * (N - 1)))
+    if b - a < 2:
+        return None
+    k = slice(a, b + 1)
+
+    def part(axis: AxisRecords) -> AxisRecords:
+        solution = axis.chain().solve()
+        assert solution.covariance is not None
+        assert solution.lag_one is not None
+        chain = ChainRecords.of_marginals(solution.state[k], solution.covariance[k], solution.lag_one[a:b])
+        return AxisRecords.of(chain, axis.lean[k], axis.noise[a:b])
+
+    return TrackRecords(
+        whole.step,
+        whole.easting[k],
+        whole.northing[k],
+        None if whole.height is None else whole.height[k],
+        part(whole.across),
+        None if whole.up is None else part(whole.up),
+    )

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from railnav.errors import CrsError, ModelError, RunError
 from railnav.survey.construction import gathered
-from railnav.survey.extension import Way, beside, end_beyond, extended, judged_again, laid_anew, told_ways, ways_beyond
+from railnav.survey.extension import Way, beside, extended, judged_again, laid_anew, told_ways, ways_beyond
+from railnav.survey.fixes import FAR, USED
 from railnav.survey.laying import Ground, knots_of, lay_runs, refuse_beside, stored_grounds
 from railnav.survey.refining import Refinement, known_model
 from railnav.survey.renewal import reassembled, renewed, renewed_records, sections_of, with_tables
@@ -158,7 +159,9 @@ def update(
         judged_again(survey.fixes)
         tracks = lay_runs(grounds, joins, labels, survey.fixes, sigma, least_share=LEAST_SHARE)
         across, up = _estimated(records, survey, grounds, tracks, receivers, kind, weight, false_alarm, left, tell)
-    end_beyond(left, survey.fixes)
+    for f in survey.fixes:
+        f.reason[f.reason == FAR] = USED
+    survey.settle_reasons(tracks)
     tell("tabulate", 0, 1)
     out = _refined(model, records, survey, grounds, joins, beyond, tracks, across, up, kind, weight)
     tell("tabulate", 1, 1)

@@ -318,3 +318,78 @@ def test_suburban_runs_refine_the_junction(shared_data):
     apart = [rms(d.slew - d.common_slew) for d in (before, after)]
     assert apart[1] < apart[0]
     assert last(refined)["beyond"] == [] or all(way["became"] is None for way in last(refined)["beyond"])
+
+
+# -------------------------------------------------------------------------------------------------------- differences
+
+
+def test_a_track_that_has_been_parted_is_compared_with_all_its_parts(piece):
+    axis, frame, _, _ = piece
+    rng = np.random.default_rng(15)
+    model = build([drive(axis, frame, rng, run_id=f"old-{p}", direction="up", day=p, stop=0.0) for p in range(3)])
+    end = axis.arc[-1]
+    leg = axis.shifted(diverging(axis.arc, 0.5 * end, gap=30.0))
+    w = np.interp(axis.arc, [0.7 * end, 0.7 * end + 10, 0.7 * end + 90, 0.7 * end + 100], [0.0, 1.0, 1.0, 0.0])
+    slewed = axis.shifted(0.12 * w)
+    new = [drive(leg, frame, rng, run_id="leg", direction="up", day=9, stop=0.0)]
+    new += [drive(slewed, frame, rng, run_id=f"main-{p}", direction="up", day=10 + p, stop=0.0) for p in range(2)]
+    grown = update(model, new, extend=True)
+    assert {"up/1", "up/2"} < set(grown.track_id)
+    found = difference(model, grown)
+    assert found.tracks == ("up", "up")
+    assert set(found.partner) == {"up/1", "up/2"}
+    assert len(found.only_new) == 1
+    assert np.isfinite(found.slew).mean() > 0.98
+    assert len(found.slew) == pytest.approx(model.length("up") / 5.0, rel=0.03)
+    across = [s for s in found.stretches if s.coordinate == "across"]
+    assert len(across) == 1
+    assert across[0].track == "up"
+    assert 0.7 * end - 30.0 < across[0].first < across[0].last < 0.7 * end + 130.0
+    assert across[0].shift == pytest.approx(0.12, abs=0.03)
+
+
+def test_independent_models_with_turnouts_are_compared_by_their_chains(junction):
+    _, _, _, model, _, new = junction
+    other = build(new)
+    found = difference(model, other)
+    assert found.relation == "independent"
+    assert set(found.tracks) == set(model.track_id)
+    assert rms((found.slew - found.common_slew) / found.sigma_slew) < 2.5
+    assert all(s.found_by == "window" for s in found.stretches)
+
+
+def test_the_cli_tells_what_is_wrong_in_one_line(piece, tmp_path):
+    from click.testing import CliRunner
+
+    from railnav.cli import main
+    from railnav.io.run import write_run
+
+    axis, frame, model, new = piece
+    model.to_file(tmp_path / "line.gpkg")
+    replace(model, record_source=None).to_file(tmp_path / "bare.gpkg")
+    write_run(new[0], tmp_path / "new")
+    away = replace(axis, east=axis.east + 900.0, north=axis.north + 900.0)
+    write_run(drive(away, frame, np.random.default_rng(1), run_id="away", day=9, stop=0.0), tmp_path / "away")
+    for words, text in (
+        (("line.gpkg", "new", "--crs", "31467"), "keeps the model's plane"),
+        (("bare.gpkg", "new"), "carries no survey records"),
+        (("line.gpkg", "away"), "another line"),
+        (("line.gpkg", "nowhere"), "does not exist"),
+    ):
+        at = [str(tmp_path / w) if not w.startswith("-") and not w.isdigit() else w for w in words]
+        done = CliRunner().invoke(main, ["update", *at, "-o", str(tmp_path / "out.gpkg")])
+        assert done.exit_code == 1, (words, done.output)
+        assert text in done.output
+        assert len(done.output.strip().splitlines()) == 1
+        assert not (tmp_path / "out.gpkg").exists()
+    done = CliRunner().invoke(
+        main, ["update", str(tmp_path / "line.gpkg"), str(tmp_path / "new"), "-o", str(tmp_path / "o.gpkg")]
+    )
+    assert done.exit_code == 0, done.output
+    assert "beyond the end of track up" in done.output
+    assert "--extend" in done.output
+    done = CliRunner().invoke(
+        main, ["update", str(tmp_path / "line.gpkg"), str(tmp_path / "new"), "-o", str(tmp_path / "l.gpkg"), "--extend"]
+    )
+    assert done.exit_code == 0, done.output
+    assert TrackModel.read(tmp_path / "l.gpkg").length("up") > 1.3 * model.length("up")
