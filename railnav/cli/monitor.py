@@ -335,9 +335,13 @@ def _print(report: Report, found: list[Exceedance], written: list[Path]) -> None
         if trend.growth.significant.any()
     ]
     print_table("Growth", ("section", "channel", "segments that change", "of", "repeats within"), grown, left=2)
-    refused = {key: reason for part in report.sections for g in part.geometries for key, reason in g.refused.items()}
+    refused: dict[str, dict[str, None]] = {}
+    for part in report.sections:
+        for g in part.geometries:
+            for key, reason in g.refused.items():
+                refused.setdefault(reason, {})[key.replace("_", " ")] = None
     print_table(
-        "Not given", ("channel", "why"), [[key.replace("_", " "), reason] for key, reason in refused.items()], left=2
+        "Not given", ("channel", "why"), [[", ".join(keys), reason] for reason, keys in refused.items()], left=2
     )
     shown = []
     for e in found[:SHOWN]:

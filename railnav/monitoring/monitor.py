@@ -14,7 +14,7 @@ from railnav.monitoring.limits import CERTAIN, Exceedance, LimitTable, Verdict, 
 from railnav.monitoring.overlay import Overlay, overlay, shifted
 from railnav.monitoring.quality import Segment, segments
 from railnav.monitoring.recording import record
-from railnav.monitoring.section import Passage, Section, onto, passages_of
+from railnav.monitoring.section import Passage, Section, onto, passages_of, told_apart
 from railnav.monitoring.trends import Trend, trends
 from railnav.monitoring.versines import Chord
 from railnav.navigation import navigate
@@ -137,6 +137,7 @@ def monitor(
     """
     if not runs:
         raise TrackError("there is no run to monitor")
+    told_apart(runs)
     passages: list[tuple[Run, Passage]] = []
     notes: list[str] = []
     for i, run in enumerate(runs):

@@ -17,6 +17,7 @@ from railnav.units import wrap_angle
 
 if TYPE_CHECKING:
     from railnav.navigation.solution import Solution
+    from railnav.run import Run
     from railnav.track.model import TrackModel
 
 FloatArray = NDArray[np.float64]
@@ -242,6 +243,20 @@ def passages_of(solution: Solution, model: TrackModel) -> list[Passage]:
     passages = [_passage(solution, model, way, np.array(kept)) for way, kept in ways]
     found = [p for p in passages if p is not None]
     return sorted(found, key=lambda p: p.extent[0] - p.extent[1])
+
+
+def told_apart(runs: Sequence[Run]) -> None:
+    """Refuse two runs of one name: what was found could not be told apart, or would count twice.
+
+    Raises
+    ------
+    TrackError
+        Two runs bear the same name.
+    """
+    names = [run.id for run in runs]
+    twice = next((name for i, name in enumerate(names) if name in names[:i]), None)
+    if twice is not None:
+        raise TrackError(f"two runs are called {twice!r}; give each run once, or another id in its run.toml")
 
 
 def onto(passage: Passage, section: Section) -> Passage | None:

@@ -139,7 +139,8 @@ def corrections(
     """Corrections that bring a deviation as near to its target as limits allow: a linear programme.
 
     minimise sum |r - t|, r = y + e, subject to least <= e <= most, |third difference of r| <= J step^3, e within the tolerance of each
-    fixed point, e = 0 at the ends. Solved exactly by HiGHS.
+    fixed point, e = 0 at the ends. Solved exactly by HiGHS. Along a fixed stretch of four nodes or more the third difference may stay what
+    that of y is there: track that is held cannot be smoothed.
 
     Parameters
     ----------
@@ -191,7 +192,8 @@ def corrections(
     for point, span in inside:
         lows[span] = np.maximum(lows[span], point.correction - point.tolerance)
         highs[span] = np.minimum(highs[span], point.correction + point.tolerance)
-    solved = _solve(y, t, lows, highs, bounds.third_difference * step**3) if (lows <= highs + 1e-12).all() else None
+    jump = _jumps(y, bounds.third_difference * step**3, inside)
+    solved = _solve(y, t, lows, highs, jump) if (lows <= highs + 1e-12).all() else None
     if solved is not None:
         return np.clip(solved, lows, np.maximum(lows, highs))
     raise InfeasibleError(_why(y, step, start, low, high, bounds, inside))
@@ -208,13 +210,24 @@ def _rows(point: FixedPoint, start: float, step: float, n: int) -> slice:
     return slice(max(a, 0), min(b, n - 1) + 1)
 
 
+def _jumps(y: FloatArray, jump: float, inside: Sequence[tuple[FixedPoint, slice]]) -> FloatArray:
+    """Bound of each third difference: where a stretch is held, track that may not be moved may stay as rough as it is there."""
+    bound = np.full(len(y) - 3, jump)
+    rough = np.abs(np.diff(y, 3))
+    for _, span in inside:
+        if span.stop - span.start > 3:
+            rows = slice(max(span.start - 3, 0), min(span.stop, len(bound)))
+            bound[rows] = np.maximum(bound[rows], rough[rows].max(initial=0.0))
+    return bound
+
+
 def _differences(n: int) -> Any:
     from scipy.sparse import diags_array
 
     return diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(n - 3, n), format="csr")
 
 
-def _solve(y: FloatArray, t: FloatArray, low: FloatArray, high: FloatArray, jump: float) -> FloatArray | None:
+def _solve(y: FloatArray, t: FloatArray, low: FloatArray, high: FloatArray, jump: FloatArray) -> FloatArray | None:
     """The programme in millimetres: r = t + p - q with p, q >= 0; None where it has no solution."""
     from scipy.optimize import linprog
     from scipy.sparse import hstack, vstack
@@ -245,7 +258,7 @@ def _solve(y: FloatArray, t: FloatArray, low: FloatArray, high: FloatArray, jump
     return np.asarray((answer.x[:n] - answer.x[n:]) / scale + t - y)
 
 
-def feasible(y: FloatArray, low: FloatArray, high: FloatArray, jump: float) -> bool:
+def feasible(y: FloatArray, low: FloatArray, high: FloatArray, jump: float | FloatArray) -> bool:
     """Whether corrections within low and high leave third differences of y + e within a bound."""
     from scipy.optimize import linprog
     from scipy.sparse import vstack
@@ -283,7 +296,7 @@ def _why(
             point, span = inside[k]
             lows[span] = np.maximum(lows[span], point.correction - point.tolerance)
             highs[span] = np.minimum(highs[span], point.correction + point.tolerance)
-        return feasible(y, lows, highs, jump)
+        return feasible(y, lows, highs, _jumps(y, jump, [inside[k] for k in kept]))
 
     if not possible([]):
         window = max(16, round(200.0 / step))
@@ -295,7 +308,7 @@ def _why(
         else:
             where = "over the whole section"
         return (
-            f"no correction between {1e3 * bounds.least:+.0f} and {1e3 * bounds.most:+.0f} mm leaves a curvature rate of at most "
+            f"no correction between {1e3 * bounds.least:+.3g} and {1e3 * bounds.most:+.3g} mm leaves a curvature rate of at most "
             f"{bounds.third_difference:.1e} 1/m^2 {where}, even without fixed points; allow more of either"
         )
     kept = list(range(len(inside)))

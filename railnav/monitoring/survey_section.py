@@ -10,7 +10,7 @@ import numpy as np
 from railnav.errors import OffModelError
 from railnav.monitoring.position import MeasuredAxis, measured_axis
 from railnav.monitoring.recording import record
-from railnav.monitoring.section import Passage, onto, passages_of, section_of
+from railnav.monitoring.section import Passage, onto, passages_of, section_of, told_apart
 from railnav.navigation import navigate
 from railnav.run import Progress, Run
 from railnav.track.model import TrackModel
@@ -40,6 +40,7 @@ def measured_section(
     OffModelError
         No run covers any of the section.
     """
+    told_apart(runs)
     section = section_of(model, tracks) if tracks else None
     found: list[tuple[Run, Passage]] = []
     for i, run in enumerate(runs):

@@ -241,6 +241,31 @@ def test_two_dates_show_what_stands_out_among_the_others():
     assert np.isnan(few.sigma).all()
 
 
+def test_two_dates_without_growth_rarely_show_any():
+    rng = np.random.default_rng(11)
+    wrong = sum(
+        bool(growth([0.0, 3.0], 1.0 + 0.1 * rng.standard_normal((2, 50))).significant.any()) for _ in range(400)
+    )
+    assert wrong < 0.1 * 400  # of sections that do not change, called changed in any of their segments
+
+
+def test_growth_is_taken_from_runs_of_one_kind_of_sensor():
+    first, second = geometry(1, month=1), geometry(2, month=4)
+    channel = second.channels["alignment_d2"]
+    noisy = replace(channel, source="IMU", values=channel.values * 1.5)
+    mixed = replace(second, channels=second.channels | {"alignment_d2": noisy})
+    assert "alignment_d2" in {t.channel for t in trends([first, second])}
+    assert "alignment_d2" not in {t.channel for t in trends([first, mixed])}
+    third = geometry(3, month=7)
+    made = next(t for t in trends([first, mixed, third]) if t.channel == "alignment_d2")
+    assert made.months == pytest.approx([0.0, 5.95], abs=0.05)
+
+
+def test_a_run_is_given_once():
+    with pytest.raises(TrackError, match="two runs are called 'car-1'; give each run once"):
+        monitor([recorded(1), recorded(1)], line(), default_limits())
+
+
 def test_growth_needs_dates():
     with pytest.raises(EstimationError, match="two dates"):
         growth([1.0, 1.0], [[1.0], [2.0]])

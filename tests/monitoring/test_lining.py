@@ -150,6 +150,19 @@ def test_fixed_points_hold():
     ) == pytest.approx(e, abs=1e-7)
 
 
+def test_a_stretch_that_is_held_stays_as_rough_as_it_is():
+    """A bridge of 30 m that must not move, on rough track: no smooth line runs through it, and the work beside it goes on."""
+    y = rough(300, 9)
+    bounds = Bounds(-0.05, 0.05, 2e-4)
+    assert np.abs(np.diff(y[100:131], 3)).max() > 5.0 * bounds.third_difference
+    e = corrections(y, np.zeros(300), 1.0, bounds, fixed=[FixedPoint("bridge", 100.0, 130.0, 0.0, 0.0)])
+    assert np.abs(e[100:131]).max() < 1e-9
+    third = np.abs(np.diff(y + e, 3))
+    assert np.r_[third[:97], third[131:]].max() <= bounds.third_difference + 1e-9
+    assert third.max() <= np.abs(np.diff(y, 3))[97:131].max() + 1e-9
+    assert np.abs(y + e)[40:90].max() < 0.5 * np.abs(y)[40:90].max()
+
+
 def test_the_contradicting_fixed_points_are_named_and_no_others():
     y = np.zeros(400)
     points = [
