@@ -18,6 +18,7 @@ from railnav.estimation.chain import Chain, solve_chain
 from railnav.estimation.menus import CorrelatedError, IncrementDrift, survey_chain
 from railnav.estimation.screening import Verdict, screen_chain
 from railnav.survey.fixes import LINKS, USED, Fixes
+from railnav.survey.surveyed import TOLD_RANGE, tells
 from railnav.vehicle.increments import SpaceIncrements, space_increments
 
 FloatArray = NDArray[np.float64]
@@ -41,6 +42,8 @@ CORRELATED, LEAST_CORRELATED, MEMORY = 3.0, 0.02, 60.0
 LEAST_STEP, LEAST_ANGLE, LEAST_FIX = 2e-4, 2e-5, 2e-3
 #: The chain holds a run when half of its NIS, freed of gross errors, stay below so much of chi-square's median (about d - 2/3).
 HOLDS = 1.3
+#: Where they do not, but stay below this, fixes are taken to be worse by as much.
+WORSE = 2.5
 #: The first seconds of a run are not judged.
 UNTOLD = 2.0
 #: More doubtful epochs than this share, and it is the model that does not hold.
@@ -134,17 +137,20 @@ def attribute(fixes: Fixes) -> Attributions:
     moved = np.linalg.norm(dX, axis=1) > 0.2
     white = _white(np.concatenate([np.zeros((1, d)), np.cumsum(dX, axis=0)]) - (place - place[0]), moved)
     sigma = np.maximum(white, LEAST_FIX)
-    K = np.diag(sigma**2)
+    share = _stated_share(fixes, rows, place, dX)
+    K = np.eye(d) * ((sigma * share) ** 2)[:, :, None]
     KdX = steps.covariance[:, :d, :d] + LEAST_STEP**2 * np.eye(d)
     dt = np.diff(time)
     error = CorrelatedError(np.maximum(CORRELATED * sigma, LEAST_CORRELATED), MEMORY, np.maximum(dt, 1e-3))
     ahead = max(LOOK_AHEAD, int(np.ceil(LOOK_SECONDS / max(float(np.median(dt)), 1e-3))))
-    for walk in WALKS:
+    trials = [(walk, 1.0) for walk in WALKS]
+    ratios: list[float] = []
+    for number, (walk, scale) in enumerate(trials):
         drift = IncrementDrift(B, FIRST_DRIFT, walk * np.sqrt(np.maximum(dt, 1e-3))[:, None] * np.ones(3))
-        chain = survey_chain(place, K, dX, KdX, drift=drift, correlated=error, nominal=place)
+        chain = survey_chain(place, scale**2 * K, dX, KdX, drift=drift, correlated=error, nominal=place)
         screening = screen_chain(
             chain,
-            outlier_range=OUTLIER_RANGE / float(sigma.mean()),
+            outlier_range=OUTLIER_RANGE / (scale * sigma * share).mean(axis=1),
             significance=SIGNIFICANCE,
             look_ahead=ahead,
             inflation=INFLATION,
@@ -152,14 +158,22 @@ def attribute(fixes: Fixes) -> Attributions:
         # before the drifts are known the first metres say nothing
         verdicts = tuple(v for v in screening.verdicts if time[v.epoch] - time[0] > UNTOLD)
         nis = solve_chain(screening.chain, covariance=False).nis[10:]
-        if float(np.median(nis)) < HOLDS * (d - 2.0 / 3.0) and len(verdicts) <= max(MOST_DOUBTFUL * len(rows), 5.0):
+        ratios.append(float(np.median(nis)) / (d - 2.0 / 3.0))
+        if ratios[-1] < HOLDS and len(verdicts) <= max(MOST_DOUBTFUL * len(rows), 5.0):
+            sigma = scale * sigma
             break
+        if (
+            number == len(WALKS) - 1 and min(ratios) < WORSE
+        ):  # all walks, and the fixes are somewhat worse than they look
+            trials.append((WALKS[int(np.argmin(ratios))], float(np.sqrt(min(ratios)))))
     else:
         return Attributions(
             judged=len(rows),
             unsure=f"fixes and increments contradict each other in {len(verdicts)} of {len(rows)} places: neither is judged by the other",
         )
-    found = [_located(a, chain, rows, time) if a.wrong == "link" else a for a in _paired(verdicts, rows, time, sigma)]
+    found = [
+        _located(a, chain, rows, time) if a.wrong == "link" else a for a in _paired(verdicts, rows, time, sigma, share)
+    ]
     for a in found:
         if a.wrong == "fix":
             bad = rows[(rows >= a.first) & (rows <= a.last)]
@@ -228,10 +242,26 @@ def _located(a: Attribution, chain: Chain, rows: IntArray, time: FloatArray) -> 
     return replace(a, first=int(rows[best - 1]), last=int(rows[best]), time=float(time[best]))
 
 
-def _paired(verdicts: tuple[Verdict, ...], rows: IntArray, time: FloatArray, sigma: FloatArray) -> list[Attribution]:
+def _stated_share(fixes: Fixes, rows: IntArray, place: FloatArray, dX: FloatArray) -> FloatArray:
+    """Stated sigmas (m, d) in terms of the run's own medians, where errors grow with them (a base station far or near); else ones."""
+    d = place.shape[1]
+    share = np.ones((len(rows), d))
+    if fixes.sigma_axes is None:
+        return share
+    third = np.abs(np.diff(place - np.concatenate([np.zeros((1, d)), np.cumsum(dX, axis=0)]), 3, axis=0))
+    for axis in range(d):
+        stated = fixes.sigma_axes[axis][rows]
+        if np.isfinite(stated).all() and tells(stated[1:-2] / float(np.median(stated)), third[:, axis]):
+            share[:, axis] = np.clip(stated / float(np.median(stated)), *TOLD_RANGE)
+    return share
+
+
+def _paired(
+    verdicts: tuple[Verdict, ...], rows: IntArray, time: FloatArray, sigma: FloatArray, share: FloatArray
+) -> list[Attribution]:
     """Verdicts as attributions; two jumps that cancel each other were of the fixes between them, for no slip undoes itself."""
     d = len(sigma)
-    jump = [v.residual[:d] * sigma if len(v.residual) >= d else np.full(d, np.nan) for v in verdicts]
+    jump = [v.residual[:d] * sigma * share[v.epoch] if len(v.residual) >= d else np.full(d, np.nan) for v in verdicts]
     size = [float(np.linalg.norm(j)) for j in jump]
     out: list[Attribution] = []
     done: set[int] = set()

@@ -71,6 +71,8 @@ class Fixes:
         Where it has an odometer: s and m.
     attributed : Attributions or None
         What fixes and increments of the run said of each other (`railnav.survey.attribution`).
+    sigma_axes : three (m,) arrays or None
+        Stated standard deviations east, north and up, m, NaN where none: what a fix weighs across a track depends on its bearing.
     """
 
     run: Run
@@ -87,6 +89,7 @@ class Fixes:
     angles: tuple[FloatArray, FloatArray, FloatArray] | None = None
     odometer: tuple[FloatArray, FloatArray] | None = None
     attributed: Attributions | None = None
+    sigma_axes: tuple[FloatArray, FloatArray, FloatArray] | None = None
 
     def __len__(self) -> int:
         return len(self.time)
@@ -121,6 +124,10 @@ def gather(run: Run, frame: GridFrame) -> Fixes:
         sigma = np.sqrt(0.5 * (gnss.sigma_east**2 + gnss.sigma_north**2))
     elif gnss.sigma_east is not None or gnss.sigma_north is not None:
         sigma = np.array(gnss.sigma_east if gnss.sigma_east is not None else gnss.sigma_north)
+    axes = None
+    if gnss.sigma_east is not None and gnss.sigma_north is not None:
+        upward = np.full(n, np.nan) if gnss.sigma_up is None else np.asarray(gnss.sigma_up, float)
+        axes = (np.asarray(gnss.sigma_east, float), np.asarray(gnss.sigma_north, float), upward)
     reason, size = np.zeros(n, np.int64), np.zeros(n)
 
     stated = np.isfinite(sigma)
@@ -156,6 +163,7 @@ def gather(run: Run, frame: GridFrame) -> Fixes:
         right=right,
         angles=_angles(run, frame, np.asarray(gnss.time), east, north),
         odometer=_odometer(run),
+        sigma_axes=axes,
     )
 
 

@@ -27,12 +27,15 @@ class Traverse:
         Place of the reference point along the curve and to its right, m; NaN where too far from it.
     sense : int
         +1 when the run goes as the curve does, -1 against it.
+    sigma : (m,) array or None
+        Stated standard deviation across the curve, m, from those east and north; None where the run does not state both.
     """
 
     fixes: Fixes
     offset: FloatArray
     right: FloatArray
     sense: int
+    sigma: FloatArray | None = None
 
 
 def traverse(nominal: Nominal, fixes: Fixes, limit: float) -> Traverse:
@@ -42,7 +45,12 @@ def traverse(nominal: Nominal, fixes: Fixes, limit: float) -> Traverse:
     sense = 1
     if np.count_nonzero(here) >= 2:
         sense = 1 if float(np.diff(s[here]).sum()) >= 0.0 else -1
-    return Traverse(fixes, s - sense * fixes.forward, d - sense * fixes.right, sense)
+    sigma = None
+    if fixes.sigma_axes is not None:
+        node = np.clip(np.rint(np.nan_to_num(s) / nominal.step), 0, len(nominal) - 1).astype(np.int64)
+        e, n = nominal.normal
+        sigma = np.hypot(fixes.sigma_axes[0] * e[node], fixes.sigma_axes[1] * n[node])  # n^T K n
+    return Traverse(fixes, s - sense * fixes.forward, d - sense * fixes.right, sense, sigma)
 
 
 @dataclass(slots=True, eq=False)
@@ -62,7 +70,9 @@ class Profiles:
     time : (K, N) array
         When the run passed the node, s, interpolated where it has no fix; constant beyond its ends.
     sigma : (K, N) array
-        Mean stated sigma, m.
+        Mean stated sigma across, m.
+    height_sigma : (K, N) array or None
+        Mean stated sigma of the heights, m.
     """
 
     right: FloatArray
@@ -72,6 +82,7 @@ class Profiles:
     height_lead: FloatArray
     time: FloatArray
     sigma: FloatArray
+    height_sigma: FloatArray | None = None
 
     @property
     def present(self) -> BoolArray:
@@ -87,7 +98,8 @@ def passing_count(count: FloatArray) -> float:
 def profiles(traverses: Sequence[Traverse], nodes: int, step: float) -> Profiles:
     """Reduce runs to node means of their used fixes."""
     K = len(traverses)
-    out = Profiles(*(np.full((K, nodes), np.nan) for _ in range(7)))
+    out = Profiles(*(np.full((K, nodes), np.nan) for _ in range(8)))
+    assert out.height_sigma is not None
     out.count[:] = 0.0
     for k, t in enumerate(traverses):
         f = t.fixes
@@ -109,7 +121,7 @@ def profiles(traverses: Sequence[Traverse], nodes: int, step: float) -> Profiles
 
         out.right[k] = mean(t.right[use])
         out.lead[k] = mean(t.offset[use] - node * step)
-        out.sigma[k] = mean(f.sigma[use])
+        out.sigma[k] = mean((f.sigma if t.sigma is None else t.sigma)[use])
         out.count[k] = np.minimum(count, passing_count(count[hit]))
         when = mean(f.time[use])
         out.time[k] = np.interp(np.arange(nodes), np.flatnonzero(hit), when[hit])
@@ -121,6 +133,12 @@ def profiles(traverses: Sequence[Traverse], nodes: int, step: float) -> Profiles
                 np.bincount(node[up], weights=f.height[use][up], minlength=nodes) / np.maximum(n_up, 1),
                 np.nan,
             )
+            if f.sigma_axes is not None:
+                out.height_sigma[k] = np.where(
+                    n_up > 0,
+                    np.bincount(node[up], weights=f.sigma_axes[2][use][up], minlength=nodes) / np.maximum(n_up, 1),
+                    np.nan,
+                )
             out.height_lead[k] = np.where(
                 n_up > 0,
                 np.bincount(node[up], weights=(t.offset[use] - node * step)[up], minlength=nodes) / np.maximum(n_up, 1),

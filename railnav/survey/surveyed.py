@@ -332,7 +332,7 @@ def white_variances(P: Profiles, residual: FloatArray, errors: list[ErrorModel],
         stated = P.sigma[k][known]
         if np.isfinite(stated).any():
             ratio = stated / float(np.nanmedian(stated))
-            if model.total < TOLD and _tells(ratio, residual[k][known]):
+            if model.total < TOLD and tells(ratio, residual[k][known]):
                 scale = np.where(np.isfinite(ratio), np.clip(ratio, *TOLD_RANGE) ** 2, 1.0)
             else:
                 doubt += np.where(np.isfinite(ratio), np.maximum(ratio**2 - 2.0, 0.0), 0.0)
@@ -342,7 +342,7 @@ def white_variances(P: Profiles, residual: FloatArray, errors: list[ErrorModel],
     return variance
 
 
-def _tells(ratio: FloatArray, residual: FloatArray) -> bool:
+def tells(ratio: FloatArray, residual: FloatArray) -> bool:
     """Whether stated sigmas tell how large errors are (a base station far or near): residuals grow with them."""
     ok = np.isfinite(ratio) & np.isfinite(residual)
     if np.count_nonzero(ok) < 80:

@@ -156,7 +156,7 @@ def _rows(P: Profiles, rows: IntArray) -> Profiles:
         height=P.height[rows],
         height_lead=P.height_lead[rows],
         time=P.time[rows],
-        sigma=np.full_like(P.sigma[rows], np.nan),
+        sigma=np.full_like(P.sigma[rows], np.nan) if P.height_sigma is None else P.height_sigma[rows],
     )
 
 

@@ -134,3 +134,37 @@ def test_the_build_tells_a_bad_fix_with_its_evidence():
     assert told[0]["time_s"] == pytest.approx(runs[0].gnss.time[i])
     run = model.provenance["build"]["runs"][0]
     assert run["fixes"]["rejected"]["contradicts the run's own odometer and gyroscopes"]["count"] == 1
+
+
+def test_base_stations_far_off_are_believed_where_they_say_so():
+    """Stated sigmas grow from 10 to 130 mm along the run, and errors with them: no good fix is called bad."""
+    for seed in range(3):
+        rng = np.random.default_rng([seed, 9])
+        (run,), _, _ = ridden(40 + seed)
+        sigma = np.linspace(0.010, 0.130, len(run.gnss))
+        stated = np.hypot(0.017, sigma)
+        latitude = run.gnss.latitude + rng.standard_normal(len(sigma)) * sigma / 6.37e6
+        longitude = run.gnss.longitude + rng.standard_normal(len(sigma)) * sigma / 4.1e6
+        far = replace(run.gnss, latitude=latitude, longitude=longitude, sigma_east=stated, sigma_north=stated)
+        found = attribute(gather(replace(run, gnss=far), FRAME))
+        assert found.judged > 500
+        assert found.found == ()
+        bad = north(replace(run, gnss=far), 100, 0.4)
+        assert [(a.wrong, a.first) for a in attribute(gather(bad, FRAME)).found] == [("fix", 100)]
+
+
+def test_what_a_fix_weighs_across_depends_on_where_the_track_goes():
+    """Stated 1 cm east and 4 cm north: a fix on a track to the east weighs 4 cm, on one to the north 1 cm."""
+    from railnav.survey.nominal import curve
+    from railnav.survey.profiles import profiles, traverse
+
+    (run,), axis, _ = ridden(8)
+    m = len(run.gnss)
+    told = replace(run.gnss, sigma_east=np.full(m, 0.01), sigma_north=np.full(m, 0.04), sigma_up=np.full(m, 0.05))
+    fixes = gather(replace(run, gnss=told), FRAME)
+    nominal = curve(axis.east[::5], axis.north[::5], 5.0)
+    laid = profiles([traverse(nominal, fixes, 60.0)], len(nominal), nominal.step)
+    e, n = nominal.normal
+    hit = laid.count[0] > 0
+    np.testing.assert_allclose(laid.sigma[0, hit], np.hypot(0.01 * e, 0.04 * n)[hit], rtol=0.02)
+    np.testing.assert_allclose(laid.height_sigma[0, hit], 0.05)
