@@ -302,6 +302,19 @@ def sweep(chain: Chain, *, borders: bool = True, keep: bool = True) -> Swept:
     return Swept(Rkk, Rkn, D, T[:, 1:], T[:, 0], log_det, float(T[:, 0] @ T[:, 0]))
 
 
+def unit_weight_rms(chain: Chain, swept: Swept, border: FloatArray) -> float:
+    """Unit-weight RMS mu = sqrt(v^T v / redundancy) of a chain, its border known: 1 if the variances are honest (spec 5, step 8).
+
+    Every observation is redundant: states begin with a prior, and the walk gives each node rows of its own. NaN without redundancy.
+    """
+    rows = int(np.count_nonzero(np.isfinite(chain.value) & np.isfinite(chain.variance)))
+    if chain.slopes is not None:
+        rows += int(np.count_nonzero(np.isfinite(chain.slopes.value)))
+    redundancy = rows - len(border)
+    v = swept.border_value - swept.border @ border
+    return float(np.sqrt(v @ v / redundancy)) if redundancy > 0 else float("nan")
+
+
 def log_evidence(chain: Chain) -> float:
     """Log of the likelihood of a chain, up to what does not depend on `noise` (spec 15.4, frame offsets taken as removed)."""
     swept = sweep(chain, borders=False, keep=False)

@@ -18,7 +18,7 @@ from railnav.errors import RunError
 from railnav.survey import report, surveyed
 from railnav.survey.angles import slopes_of
 from railnav.survey.attribution import attribute
-from railnav.survey.axis import solve, sweep
+from railnav.survey.axis import solve, sweep, unit_weight_rms
 from railnav.survey.fixes import Fixes, gather
 from railnav.survey.joining import join_tracks
 from railnav.survey.layout import COARSE_STEP, Join, lay_out
@@ -273,6 +273,7 @@ def _estimated(
                 chains[i], swept[i], offsets.run.ravel()[who], offsets.covariance[np.ix_(who, who)], sure=True
             )
             t.axis = t.estimate.state[:, 0]
+            t.unit_weight = unit_weight_rms(chains[i], swept[i], offsets.run.ravel()[who])
             t.noise = surveyed.free_in_gaps(t, surveyed.local_noise(t.estimate, t.noise_level, t.nominal.step))
         # a tunnel's first curve is a guess: where angles lead through it, it is laid until it stays
         astray = any(t.slopes is not None and float(np.abs(t.axis).max()) > SETTLED for t in tracks)

@@ -13,7 +13,8 @@ It is one dictionary of JSON values in `model.provenance["build"]`; an unknown n
   - `coverage`: `length_m`, `share` (of the tracks it took part in), `gaps`: number of gaps longer than 200 m
 - `receivers`: one entry a kind of receiver: `receiver`, `runs`, `offset_east_m`, `offset_north_m`, `sigma_east_m`, `sigma_north_m`
 - `datum`: `rule` (plain words), `observable` (bool), `sigma_east_m`, `sigma_north_m`
-- `tracks`: one entry a track: `track`, `length_m`, `runs` (identifiers), `sigma_cross_m` and `sigma_cross_95_m`, `heights` (bool),
+- `tracks`: one entry a track: `track`, `length_m`, `runs` (identifiers), `sigma_cross_m` and `sigma_cross_95_m`, `unit_weight_rms`
+  (of the chain across: 1 where the weights are honest), `heights` (bool),
   `survey_again`: list of {`from_m`, `to_m`, `sigma_m`, `reason`}
 - `verdicts`: every gross error (`railnav.survey.verdicts`): `total`, and `list` of up to 300
 - `repeatability`: one entry a kind of receiver: axes from single runs of different dates compared, as a histogram
@@ -377,6 +378,7 @@ def _track(survey: Survey, t: Surveyed, table: KnotTable, heights: bool) -> dict
         "runs": [survey.fixes[i].run.id for k, i in enumerate(t.runs) if t.profile.present[k].any()],
         "sigma_cross_m": _number(float(np.median(sigma))),
         "sigma_cross_95_m": _number(float(np.quantile(sigma, 0.95))),
+        "unit_weight_rms": _number(t.unit_weight),
         "heights": heights,
         "survey_again": _survey_again(t, sigma, float(table.offset[-1])),
     }

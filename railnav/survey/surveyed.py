@@ -75,6 +75,8 @@ class Surveyed:
         What gyroscopic angles say.
     masks : tuple of ((m,) bool array or None) or None
         Fixes of each run that belong to this track, where a run follows several.
+    unit_weight : float
+        Unit-weight RMS of the last estimate; NaN before.
     """
 
     name: str
@@ -89,6 +91,7 @@ class Surveyed:
     estimate: Estimate | None = None
     slopes: Slopes | None = None
     masks: tuple[BoolArray | None, ...] | None = None
+    unit_weight: float = float("nan")
 
     @property
     def design(self) -> FloatArray:

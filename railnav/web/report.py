@@ -171,7 +171,7 @@ def run_rows(build: Mapping[str, Any]) -> tuple[Sequence[str], list[list[str]], 
 
 def track_rows(build: Mapping[str, Any]) -> tuple[Sequence[str], list[list[str]], int]:
     """Tabulate the tracks of a build: length, accuracy, and where to survey again."""
-    columns = ("track", "survey again", "length", "runs", "sigma across", "95 %", "heights")
+    columns = ("track", "survey again", "length", "runs", "sigma across", "95 %", "unit weight", "heights")
     rows = []
     for track in build.get("tracks", []):
         again = track.get("survey_again") or []
@@ -184,6 +184,7 @@ def track_rows(build: Mapping[str, Any]) -> tuple[Sequence[str], list[list[str]]
                 f"{len(track.get('runs') or [])}",
                 words.length(track.get("sigma_cross_m"), 2),
                 words.length(track.get("sigma_cross_95_m"), 2),
+                words.NOTHING if track.get("unit_weight_rms") is None else f"{track['unit_weight_rms']:.2f}",
                 "yes" if track.get("heights") else "no",
             ]
         )

@@ -533,6 +533,12 @@ def test_fixes_that_follow_one_another_are_one_verdict_and_counted_one_by_one():
     assert told["verdicts"]["total"] >= gone >= 11
 
 
+def test_the_unit_weight_of_a_track_is_one_and_told():
+    runs, _, _, _ = single_line(4, km=3.0)
+    (track,) = report(build(runs))["tracks"]
+    assert 0.85 < track["unit_weight_rms"] < 1.15
+
+
 def test_repeatability_between_dates_is_a_histogram():
     runs, _, _, _ = single_line(4, km=3.0)
     (told,) = report(build(runs))["repeatability"]
