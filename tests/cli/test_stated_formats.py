@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -212,3 +214,29 @@ def test_chainage_of_a_file_becomes_line_references(here: Path) -> None:
             for m in (before, after)
         ]
         assert ends[0] == pytest.approx(ends[1], abs=1e-12)
+
+
+def test_a_train_that_backs_up_keeps_its_heading_and_shows_a_negative_speed(here: Path) -> None:
+    """In the truth and in the solution; the odometer's distance is unsigned and grows all the same."""
+    from railnav.io.run import write_run
+    from railnav.simulation import SERVICE, Leg, simulate
+
+    legs = [
+        Leg(("77R-03",), start=500.0, finish=1200.0, dwell=20.0),
+        Leg(("77R-03",), start=1200.0, finish=700.0, dwell=20.0),
+    ]
+    run, truth = simulate(read_model(here / "line.gpkg"), legs, seed=2, outfit=SERVICE, run_id="shunt")
+    write_run(run, here / "shunt", truth=truth)
+    assert np.diff(run.odometer.distance if run.odometer and run.odometer.distance is not None else []).min() >= 0.0
+    _said("navigate", "shunt", "-m", "line.gpkg", "-o", "s.csv")
+    stated, true = (
+        {row["time_s"]: row for row in csv.DictReader(Path(name).read_text(encoding="utf-8").splitlines())}
+        for name in ("s.csv", "shunt/truth.csv")
+    )
+    back = [time for time in stated if time in true and float(true[time]["speed_m_s"]) < -2.0]
+    assert len(back) > 100
+    forward = float(next(iter(true.values()))["heading_deg"])
+    for time in back:
+        assert float(stated[time]["speed_m_s"]) == pytest.approx(float(true[time]["speed_m_s"]), abs=0.5)
+        for row in (stated[time], true[time]):
+            assert abs(float(row["heading_deg"]) - forward) < 20.0  # the track's own bend, not half a turn
