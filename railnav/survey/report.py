@@ -161,7 +161,7 @@ def compose(
         "receivers": receivers,
         "datum": datum,
         "tracks": told,
-        "verdicts": verdicts(survey.fixes, tracks, tables, runs),
+        "verdicts": verdicts(survey.fixes, tracks, heights, tables, runs),
         "repeatability": repeatability(survey.fixes, tracks, offsets),
         "warnings": _warnings(survey, offsets, datum, tracks, heights, runs, told),
         "settings": {

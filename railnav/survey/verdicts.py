@@ -1,15 +1,17 @@
-"""Every gross error of a build with time, place, size and reason: fixes, stretches on another track, and links.
+"""Every gross error of a build with time, place, size and reason: fixes, stretches on another track, links, and heights.
 
-`total` counts single fixes, stretches and links; `list` holds one entry for fixes that follow one another and have one reason. Keys:
-`what`: "fix" | "stretch" | "link"; `run`; `time_s` (None for a stretch), `to_time_s` where it lasts; `track`, `offset_m`, `to_m` where it
-is long; `easting_m`, `northing_m` of its worst; `size` and `unit` ("m", or "rad" for a gyro's slope); `fixes`, how many; `reason`. Where
-fixes and increments of one run contradicted each other (`railnav.survey.attribution`) also `statistic` and `limit` (chi-square) and
-`evidence`: ln odds of this verdict over the other, of two clones.
+`total` counts single fixes, stretches, links, and heights of nodes; `list` holds one entry for fixes (heights) that follow one another
+and have one reason. Keys: `what`: "fix" | "stretch" | "link" | "height"; `run`; `time_s` (None for a stretch), `to_time_s` where it lasts;
+`track`, `offset_m`, `to_m` where it is long; `easting_m`, `northing_m` of its worst; `size` and `unit` ("m", or "rad" for a gyro's
+slope); `fixes`, how many (of a height: nodes); `reason`. Where fixes and increments of one run contradicted each other
+(`railnav.survey.attribution`) also `statistic` and `limit` (chi-square) and `evidence`: ln odds of this verdict over the other, of two
+clones.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +23,7 @@ from railnav.survey.surveyed import Surveyed
 
 if TYPE_CHECKING:
     from railnav.survey.attribution import Attribution
+    from railnav.survey.vertical import Heights
     from railnav.track.alignment import KnotTable
 
 FloatArray = NDArray[np.float64]
@@ -30,12 +33,18 @@ IntArray = NDArray[np.int64]
 MOST_VERDICTS = 300
 #: Fixes of one reason no farther apart than this are one verdict, s.
 TOGETHER = 5.0
+#: Heights that were left out no farther apart than this are one verdict, m.
+NEAR = 60.0
 #: What a receiver says itself, or where nothing is to be compared with, comes last in the list.
 MILD = frozenset({REASONS[STATED_SIGMA], REASONS[FAR], REASONS[BEYOND]})
 
 
 def verdicts(
-    fixes: Sequence[Fixes], tracks: Sequence[Surveyed], tables: Sequence[KnotTable], runs: Sequence[dict[str, Any]]
+    fixes: Sequence[Fixes],
+    tracks: Sequence[Surveyed],
+    heights: Sequence[Heights | None],
+    tables: Sequence[KnotTable],
+    runs: Sequence[dict[str, Any]],
 ) -> dict[str, Any]:
     """Gather the verdicts of a build.
 
@@ -44,6 +53,8 @@ def verdicts(
     fixes : sequence of Fixes
         Of the runs that took part.
     tracks : sequence of Surveyed
+    heights : sequence of (Heights or None)
+        Those of the tracks.
     tables : sequence of KnotTable
         Their knots: offsets are those of the model.
     runs : sequence of dict
@@ -52,7 +63,7 @@ def verdicts(
     Returns
     -------
     dict
-        `total` and `list`: stretches first, then links, then fixes, the largest of each first.
+        `total` and `list`: stretches first, then links, fixes and heights, the largest of each first.
     """
     found: list[dict[str, Any]] = []
     place: dict[int, tuple[str, FloatArray]] = {}
@@ -62,6 +73,10 @@ def verdicts(
             place[i] = (t.name, laid.offset * scale)
         found += [_slip(fixes[t.runs[k]], t, k, node, size, scale) for k, node, size in slips(t)]
     total = len(found)
+    for t, h, table in zip(tracks, heights, tables, strict=True):
+        if h is not None:
+            total += len(h.gross)
+            found += _heights(fixes, t, h, float(table.offset[-1]) / (len(t.nominal) - 1))
     for i, f in enumerate(fixes):
         name, offset = place.get(i, ("", np.full(len(f), np.nan)))
         along = _everywhere(offset)
@@ -87,7 +102,7 @@ def verdicts(
                     "reason": REASONS[OTHER_TRACK],
                 }
             )
-    order = {"stretch": 0, "link": 1, "fix": 2}
+    order = {"stretch": 0, "link": 1, "fix": 2, "height": 3}
     found.sort(key=lambda v: (order[v["what"]], v["reason"] in MILD, -abs(v["size"] or 0.0)))
     return {"total": total, "list": found[:MOST_VERDICTS]}
 
@@ -128,6 +143,36 @@ def _fixes(f: Fixes, group: IntArray, track: str, offset: FloatArray) -> dict[st
         "reason": REASONS[f.reason[worst]],
     }
     return entry | _until(f, group[-1], group[0], offset)
+
+
+def _heights(fixes: Sequence[Fixes], t: Surveyed, h: Heights, knot: float) -> Iterator[dict[str, Any]]:
+    """Heights at nodes that were left out; those of one run that follow one another within `NEAR` are one verdict."""
+    rows = sorted(h.gross)
+    edges = [
+        i
+        for i in range(1, len(rows))
+        if rows[i][0] != rows[i - 1][0] or (rows[i][1] - rows[i - 1][1]) * t.nominal.step > NEAR
+    ]
+    for a, b in pairwise([0, *edges, len(rows)]):
+        if a == b:
+            continue
+        worst = max(rows[a:b], key=lambda row: abs(row[3]))
+        first, last = rows[a][1], rows[b - 1][1]
+        times = sorted(row[2] for row in rows[a:b])
+        entry = {
+            "what": "height",
+            "run": fixes[worst[0]].run.id,
+            "time_s": _number(times[0], 3),
+            "track": t.name,
+            "offset_m": _number(first * knot, 1),
+            "easting_m": _number(float(t.nominal.easting[worst[1]]), 2),
+            "northing_m": _number(float(t.nominal.northing[worst[1]]), 2),
+            "size": _number(worst[3], 2),
+            "unit": "m",
+            "fixes": b - a,
+            "reason": "gross error in height",
+        }
+        yield entry | ({"to_time_s": _number(times[-1], 3), "to_m": _number(last * knot, 1)} if b - a > 1 else {})
 
 
 def _until(f: Fixes, last: int, first: int, offset: FloatArray) -> dict[str, Any]:

@@ -45,6 +45,8 @@ class Heights:
         Random walk of the vertical curvature, 1/m per sqrt(m).
     models : dict
         Error model of each kind of receiver in height.
+    gross : tuple of (int, int, float, float)
+        Node means left out: run, node, time, s, and how far off, m.
     """
 
     height: FloatArray
@@ -55,6 +57,7 @@ class Heights:
     estimate: Estimate
     noise: FloatArray
     models: dict[str, ErrorModel]
+    gross: tuple[tuple[int, int, float, float], ...] = ()
 
 
 def estimate_heights(
@@ -109,6 +112,7 @@ def estimate_heights(
     axes = [_middle(c, p, offsets.run) for _, p, c, _ in work]
     levels = [0.0] * len(work)
     rejected = [0] * len(work)
+    gross: list[tuple[tuple[int, int, float, float], ...]] = [()] * len(work)
     estimates: list[Estimate] = []
     for turn in range(ROUNDS):
         swept = []
@@ -120,6 +124,9 @@ def estimate_heights(
             wild = np.abs(residual) > GROSS_RATIO * total + slack
             rejected[w] = int(np.count_nonzero(wild))
             chain.variance[wild] = np.nan
+            gross[w] = tuple(
+                (part.runs[k], int(i), float(chain.time[k, i]), float(residual[k, i])) for k, i in np.argwhere(wild)
+            )
             chain.slopes = slopes_of(part, axes[w], up=True)
             if turn == 0:
                 levels[w] = choose_noise(chain)
@@ -143,6 +150,7 @@ def estimate_heights(
             estimate=estimates[w],
             noise=chain.noise,
             models=models,
+            gross=gross[w],
         )
     return found, offsets
 

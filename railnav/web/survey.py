@@ -93,7 +93,7 @@ def _gross(verdicts: Mapping[str, Any]) -> Section:
     many = f" The table holds the {len(rows)} gravest." if len(verdicts["list"]) > len(rows) else ""
     return Section(
         "Gross errors",
-        f"{verdicts['total']:,} fixes, stretches on another track, and links (angles, odometer) were set aside; none of them is used. "
+        f"{verdicts['total']:,} fixes, heights, stretches on another track and links (angles, odometer) were set aside; none is used. "
         "Times count from the start of the run. Where fixes and increments of one run contradicted each other, two clones of its filter "
         f"went on, one without the fix, one without the link: evidence is the logarithm of the odds of what is said.{many}",
         [Table(columns, rows, 4)],

@@ -533,6 +533,18 @@ def test_fixes_that_follow_one_another_are_one_verdict_and_counted_one_by_one():
     assert told["verdicts"]["total"] >= gone >= 11
 
 
+def test_heights_that_are_left_out_are_told_with_time_and_place():
+    runs, _, _, _ = single_line(4, km=3.0)
+    height = runs[1].gnss.height.copy()
+    height[300:320] += 5.0
+    told = report(build([runs[0], changed(runs[1], height=height), runs[2]]))["verdicts"]
+    (high,) = (v for v in told["list"] if v["what"] == "height" and v["run"] == "run-2")
+    t = runs[1].gnss.time
+    assert (high["time_s"], high["to_time_s"]) == (pytest.approx(t[300], abs=1.5), pytest.approx(t[319], abs=1.5))
+    assert high["size"] == pytest.approx(5.0, abs=0.3)
+    assert 40.0 < abs(high["to_m"] - high["offset_m"]) < 120.0
+
+
 def test_the_unit_weight_of_a_track_is_one_and_told():
     runs, _, _, _ = single_line(4, km=3.0)
     (track,) = report(build(runs))["tracks"]
