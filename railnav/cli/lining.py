@@ -65,9 +65,7 @@ TABLE_ENDINGS = (".csv", ".parquet")
 @click.option(
     "--ramp",
     type=click.FloatRange(0, 100, min_open=True),
-    default=1.0,
-    show_default=True,
-    help="How fast corrections may begin and fade out at the ends, mm a metre.",
+    help="How fast corrections may begin and fade out at the ends, mm a metre.  [default: 1, or what the other limits need]",
 )
 @json_option
 def command(
@@ -89,7 +87,7 @@ def command(
     least_lift: float,
     most_lift: float,
     curvature_rate: float,
-    ramp: float,
+    ramp: float | None,
     as_json: bool,
 ) -> None:
     """Plan slews and lifts from the measured track to its design or a smoothed target.
@@ -141,7 +139,12 @@ def command(
             raise InputError("holds no alignment", file=design)
     names = [name.strip() for name in tracks.split(",") if name.strip()] if tracks is not None else []
     limits = LiningLimits(
-        most_slew / 1e3, least_lift / 1e3, most_lift / 1e3, curvature_rate, curvature_rate, ramp / 1e3
+        most_slew / 1e3,
+        least_lift / 1e3,
+        most_lift / 1e3,
+        curvature_rate,
+        curvature_rate,
+        None if ramp is None else ramp / 1e3,
     )
     with progress() as tell:
         recorded = [read_run(run) for run in runs]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,8 @@ FloatArray = NDArray[np.float64]
 
 #: A plan on an axis known worse than this is not for a machine, m.
 USABLE = 0.02
+#: How fast corrections may begin and fade out, gentlest first, m/m.
+RAMPS = (1e-3, 2e-3, 5e-3, 1e-2, 2e-2)
 #: A shape known worse than this is said, m.
 COARSE_SHAPE = 0.002
 #: Chord of the versines, m.
@@ -43,8 +45,9 @@ class LiningLimits:
         Greatest third derivative of the deviation left in plan, 1/m^2.
     gradient_rate : float
         The same in profile, 1/m^2.
-    ramp : float
-        Greatest correction over the distance from the nearer end, m/m: how fast the work may begin and fade out.
+    ramp : float or None
+        Greatest correction over the distance from the nearer end, m/m: how fast the work may begin and fade out. None: 1 mm/m, or
+        as much more as the other limits need; the plan's notes say so.
     """
 
     most_slew: float = 0.10
@@ -52,7 +55,7 @@ class LiningLimits:
     most_lift: float = 0.10
     curvature_rate: float = 5e-6
     gradient_rate: float = 5e-6
-    ramp: float = 1e-3
+    ramp: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -238,15 +241,15 @@ def line_up(
     y = _noded(deviation, measured.step, step, nodes)
     s = d[nodes]
     aim = np.zeros(len(y)) if name else whittaker(y, step, cutoff)
-    bounds = Bounds(-limits.most_slew, limits.most_slew, limits.curvature_rate, ramp=limits.ramp)
+    bounds = Bounds(-limits.most_slew, limits.most_slew, limits.curvature_rate)
     notes += _outside(fixed_slew, "slew", s, step) + _outside(fixed_lift, "lift", s, step)
-    slew = _corrected(measured, y, aim, step, bounds, fixed_slew, float(s[0]))
+    slew = _ramped("slews", limits.ramp, notes, measured, y, aim, step, bounds, fixed_slew, float(s[0]))
     lift, z = np.full(len(s), np.nan), np.full(len(s), np.nan)
     if np.isfinite(level).all():
         z = _noded(level, measured.step, step, nodes)
         goal = z if free_level else np.zeros(len(z))
-        rise = Bounds(limits.least_lift, limits.most_lift, limits.gradient_rate, ramp=limits.ramp)
-        lift = _corrected(measured, z, goal, step, rise, fixed_lift, float(s[0]))
+        rise = Bounds(limits.least_lift, limits.most_lift, limits.gradient_rate)
+        lift = _ramped("lifts", limits.ramp, notes, measured, z, goal, step, rise, fixed_lift, float(s[0]))
     else:
         notes.append("no heights along the whole stretch: no lifts")
     fine_slew, fine_lift = _between(s, slew, d), _between(s, lift, d)
@@ -323,6 +326,35 @@ def _sigma(place: float, shape: float, local: FloatArray | None, rows: NDArray[n
     """
     relative = 1.0 if local is None else local[rows] / place
     return np.asarray((place if absolute or not math.isfinite(shape) else shape) * relative * np.ones(len(rows)))
+
+
+def _ramped(
+    what: str,
+    ramp: float | None,
+    notes: list[str],
+    measured: MeasuredAxis,
+    deviation: FloatArray,
+    target: FloatArray,
+    step: float,
+    bounds: Bounds,
+    fixed: Sequence[FixedPoint],
+    start: float,
+) -> FloatArray:
+    """Corrections that begin and fade out as gently as they can; a ramp that was asked for is kept."""
+    if ramp is not None:
+        return _corrected(measured, deviation, target, step, replace(bounds, ramp=ramp), fixed, start)
+    for gentle in RAMPS:
+        try:
+            out = corrections(deviation, target, step, replace(bounds, ramp=gentle), fixed=fixed, start=start)
+        except InfeasibleError:
+            continue
+        if gentle > RAMPS[0]:
+            notes.append(
+                f"{what} begin and fade out at up to {1e3 * gentle:.0f} mm a metre: gentler ramps at the ends of the work leave too much "
+                "change of curvature there"
+            )
+        return out
+    return _corrected(measured, deviation, target, step, bounds, fixed, start)
 
 
 def _corrected(

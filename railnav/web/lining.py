@@ -187,12 +187,17 @@ def _spread(plan: LiningPlan) -> Section:
 
 def _limits(plan: LiningPlan) -> Section:
     limit = plan.limits
+    fade = (
+        "as gently as the other limits let them"
+        if limit.ramp is None
+        else f"by {1e3 * limit.ramp:g} mm a metre at most"
+    )
     rows: list[list[str]] = [
         ["greatest slew", words.length(limit.most_slew, 3)],
         ["lifts", f"{1e3 * limit.least_lift:.0f} to {1e3 * limit.most_lift:.0f} mm"],
         ["change of curvature left, plan", f"{limit.curvature_rate:.1e} 1/m^2"],
         ["change of curvature left, profile", f"{limit.gradient_rate:.1e} 1/m^2"],
-        ["ends", f"stay; corrections begin and fade out by {1e3 * limit.ramp:g} mm a metre at most"],
+        ["ends", f"stay; corrections begin and fade out {fade}"],
     ]
     for what, points in (("slew", plan.fixed_slew), ("lift", plan.fixed_lift)):
         rows += [[f"{what} at {p.name}", f"{1e3 * p.correction:+.1f} +- {1e3 * p.tolerance:.1f} mm"] for p in points]

@@ -288,6 +288,12 @@ def test_the_work_fades_in_and_out_at_its_ends():
         end = np.minimum(plan.distance - plan.distance[0], plan.distance[-1] - plan.distance)
         assert (np.abs(plan.slew) <= ramp * end + 1e-9).all()
         assert np.abs(plan.slew).max() == pytest.approx(0.04, abs=2e-3)
+    # asked for, a ramp is kept or refused; left open, it is as steep as the change of curvature at the ends needs, and no steeper
+    y[:8] = 0.10
+    with pytest.raises(InfeasibleError):
+        line_up(axis(y), designs=[design_of(line(), 0.0, 640.0)], limits=LiningLimits(ramp=1e-3))
+    plan = line_up(axis(y), designs=[design_of(line(), 0.0, 640.0)])
+    assert any("slews begin and fade out at up to" in note for note in plan.notes)
     # a least lift above zero begins and ends at zero as well
     limits = LiningLimits(least_lift=0.02)
     plan = line_up(axis(np.zeros(1200), np.zeros(1200)), limits=limits)
