@@ -57,12 +57,12 @@ TAGS = 6
 #: Real-valued marks of a hypothesis: time the slip began (-inf: none), time since when the wheel agrees again, evidence that fades, how
 #: much of it is believed, path coordinate up to which balises are accounted for; the evidence that fades if the receiver has gone astray,
 #: its error across the track then, m, and that error's variance (negative: not known yet); the same if the run's frame is off from the
-#: start; then its ledger, what each kind of evidence has added to its log-weight.
+#: start, and the odds of that, ln, which do not fade; then its ledger, what each kind of evidence has added to its log-weight.
 SLIP_SINCE, AGREE_SINCE, FADING, BELIEVED, PASSED, ASTRAY, ASTRAY_CROSS, ASTRAY_VARIANCE = range(8)
-FRAMED, FRAMED_CROSS, FRAMED_VARIANCE = range(8, 11)
+FRAMED, FRAMED_CROSS, FRAMED_VARIANCE, FRAMED_ODDS = range(8, 12)
 #: Dead reckoning by the wheel from a while ago: when it began, place, wheel distance and scale then, variances of place and scale; twice,
 #: the older one in use.
-CHECK = 11
+CHECK = 12
 CHECK_SIZE = 6
 CHECK_TIME, CHECK_PLACE, CHECK_WHEEL, CHECK_SCALE, CHECK_VARIANCE, CHECK_SCALE_VARIANCE = range(6)
 LEDGER = CHECK + 2 * CHECK_SIZE

@@ -617,7 +617,7 @@ def fix_all(fil, net, shared, bank, work, row):
         nis, logdet = work.slot[h, S_NIS], work.slot[h, S_SAID]
         if step > 0.0 or tag > 0.0:
             nis, logdet = position_row(fil, net, shared, bank, work, h, row)
-        stray(fil, bank, work, h, max(time - common[C_FIX_TIME], 0.0), held)
+        stray(fil, bank, work, h, max(time - common[C_FIX_TIME], 0.0), nis, held)
         said = -0.5 * (min(nis, held) + logdet)
         work.slot[h, S_SAID] = said
         most = max(most, said)

@@ -288,9 +288,8 @@ class Engine:
                 bank.info[h] = 0.0
                 bank.info[h, [paths.SLIP_SINCE, paths.AGREE_SINCE]] = -np.inf
                 bank.info[h, paths.ASTRAY] = -np.inf
-                bank.info[h, paths.FRAMED] = math.log(settings.frame_fault) if settings.frame_fault > 0.0 else -np.inf
-                bank.info[h, paths.ASTRAY_VARIANCE] = -1.0
-                bank.info[h, paths.FRAMED_VARIANCE] = settings.frame_fault_sigma**2
+                bank.info[h, paths.FRAMED_ODDS] = -np.inf
+                bank.info[h, [paths.ASTRAY_VARIANCE, paths.FRAMED_VARIANCE]] = -1.0
                 bank.info[h, _CHECKS] = np.inf, -np.inf
                 bank.info[h, paths.BY_PATH] = math.log(prior)
                 bank.info[h, paths.PASSED] = local

@@ -22,6 +22,7 @@ from railnav.matching._kernels import (
     FADING,
     FRAMED,
     FRAMED_CROSS,
+    FRAMED_ODDS,
     FRAMED_VARIANCE,
     P_D_EAST,
     P_D_NORTH,
@@ -43,6 +44,8 @@ from railnav.navigation.columns import (
     K_ASTRAY_TIME,
     K_ASTRAY_WALK,
     K_CORRELATED,
+    K_FRAME_FAULT,
+    K_FRAME_FAULT_SIGMA,
     K_GNSS_TIME,
     K_MEMORY,
     K_ODOMETER_SLIP,
@@ -80,27 +83,28 @@ def keep_check(fil, bank, h, time, slipping):
 
 
 @part
-def wander(info, error, variance, off, white, walk, held):
-    """Let a fix into an error across the track that may be anything and wanders by `walk` (variance); gives -2 ln p of the fix."""
-    # info (INFO,): its error and variance at the indices `error` and `variance`; a negative variance: not known yet
+def wander(info, error, variance, off, white, walk):
+    """Let a fix into an error across the track that may be anything and wanders by `walk` (variance); gives its NIS and variance."""
+    # info (INFO,): its error and variance at the indices `error` and `variance`; a negative variance: not known yet, NaN is given
     if info[variance] < 0.0:
         info[error] = off
         info[variance] = white
-        return np.nan
+        return np.nan, white
     spread = info[variance] + walk
     total = spread + white
     off -= info[error]
     info[error] += spread / total * off
     info[variance] = spread * white / total
-    return min(off * off / total, held) + math.log(total)
+    return off * off / total, total
 
 
 @part
-def stray(fil, bank, work, h, since, held):
+def stray(fil, bank, work, h, since, nis, held):
     """How much likelier a fix is across the track if the receiver has gone astray, and if the run's frame is off, ln, into its slot.
 
     The error is then anything: it wanders, fast for a receiver astray, and for a frame no faster than the correlated part does. Call
-    it before the fix is let in: `work` holds the innovation and its covariance. All laws saturate alike.
+    it before the fix is let in: `work` holds the innovation and its covariance. What the fix says along the track, given across, is
+    the same under all laws, and all saturate alike, as a whole: else a track that is all wrong would be let off its errors along.
     """
     k = fil.settings
     info = bank.info[h]
@@ -117,13 +121,19 @@ def stray(fil, bank, work, h, since, held):
     error = innovation + east * tn - north * te
     usual = fix[4] * tn * tn - 2.0 * fix[6] * te * tn + fix[5] * te * te
     white = fix[2] * tn * tn + fix[3] * te * te
-    sound = min(innovation * innovation / usual, held) + math.log(usual)
-    astray = wander(info, ASTRAY_CROSS, ASTRAY_VARIANCE, error, white, k[K_ASTRAY_WALK] ** 2 * since, held)
-    framed = wander(
-        info, FRAMED_CROSS, FRAMED_VARIANCE, error, white, 2.0 * scale * scale / k[K_GNSS_TIME] * since, held
-    )
-    slot[S_ASTRAY] = 0.5 * (sound - astray) if astray == astray else 0.0
-    slot[S_FRAMED] = 0.5 * (sound - framed) if framed == framed else 0.0
+    along = max(nis - innovation * innovation / usual, 0.0)
+    sound = min(nis, held) + math.log(usual)
+    astray, spread = wander(info, ASTRAY_CROSS, ASTRAY_VARIANCE, error, white, k[K_ASTRAY_WALK] ** 2 * since)
+    slot[S_ASTRAY] = 0.5 * (sound - min(along + astray, held) - math.log(spread)) if astray == astray else 0.0
+    walk = 2.0 * scale * scale / k[K_GNSS_TIME] * since
+    framed, spread = wander(info, FRAMED_CROSS, FRAMED_VARIANCE, error, white, walk)
+    slot[S_FRAMED] = 0.5 * (sound - min(along + framed, held) - math.log(spread)) if framed == framed else 0.0
+    # that a frame is off, and off by just this much, stays as odd as it was: no length of the run makes it likelier
+    if k[K_FRAME_FAULT] > 0.0:
+        usual = scale * scale + white
+        anywhere = usual + k[K_FRAME_FAULT_SIGMA] ** 2
+        size = info[FRAMED_CROSS] * info[FRAMED_CROSS] / anywhere
+        info[FRAMED_ODDS] = math.log(k[K_FRAME_FAULT]) + 0.5 * (math.log(usual / anywhere) - size)
 
 
 @part
@@ -157,7 +167,7 @@ def weigh_positions(fil, bank, slot, h, said, since):
         info[FADING] = sound + said
         info[ASTRAY] = astray + said + slot[S_ASTRAY]
     info[FRAMED] = fade * info[FRAMED] + said + slot[S_FRAMED]
-    return log_sum(log_sum(info[FADING], info[ASTRAY]), info[FRAMED])
+    return log_sum(log_sum(info[FADING], info[ASTRAY]), info[FRAMED] + info[FRAMED_ODDS])
 
 
 @part
@@ -203,7 +213,8 @@ def residual_bound(fil, shared, bank, work, h):
     bound = abs(error) + fil.risk[2] * math.sqrt(variance)
     # a frame that is off across the track is off along as well, as far as nothing else has told the place
     info = bank.info[h]
-    framed = math.exp(info[FRAMED] - log_sum(log_sum(info[FADING], info[ASTRAY]), info[FRAMED]))
+    framed = info[FRAMED] + info[FRAMED_ODDS]
+    framed = math.exp(framed - log_sum(log_sum(info[FADING], info[ASTRAY]), framed))
     if framed <= fil.risk[0]:
         return bound
     share = min(variance_of(bank.P_sqrt[h], fil.at[POSITION]) / variance, 1.0)
