@@ -241,6 +241,35 @@ def test_mile_posts_stay_where_they_stand_when_a_track_grows_at_its_start(piece)
     assert longer.mileposts.offset[0] > 500.0
 
 
+def test_kilometres_and_buffer_stops_stay_too(piece):
+    from railnav.track.chainage import LineReference, LineReferences
+
+    _, _, model, new = piece
+    line = LineReference("7", np.arange(3), np.arange(4) * 1000.0, np.full(3, 1000.0))
+    at = np.array([50.0, 1200.0])
+    references = LineReferences((line,), np.zeros(2, np.int64), np.zeros(2, np.int64), at, at + 300.0)
+    kinds = model.nodes.kind.copy()
+    kinds[:] = NodeKind.BUFFER_STOP
+    known = replace(model, references=references, line=("7",), nodes=replace(model.nodes, kind=kinds))
+    longer = update(known, new, extend=True)
+    assert longer.line == ("7",)
+    assert (longer.references.position == references.position).all()
+    for before, after in zip(at, longer.references.offset, strict=True):
+        a, b = model.at("up", before), longer.at("up", after)
+        assert np.hypot(a.easting - b.easting, a.northing - b.northing) < 0.1
+    # its ends lie elsewhere now: other nodes, of which nobody said that they are buffer stops
+    assert not set(longer.nodes.id) & set(model.nodes.id)
+    assert (longer.nodes.kind == NodeKind.END_OF_MODEL).all()
+
+
+def test_a_run_without_heights_does_not_lengthen_a_track_that_has_them(piece):
+    _, _, model, new = piece
+    flat = [replace(r, gnss=replace(r.gnss, height=None)) for r in new]
+    told = last(update(model, flat, extend=True))
+    assert {way["became"] for way in told["beyond"]} == {None}
+    assert any("has heights and run" in w for w in told["warnings"])
+
+
 def test_a_loop_becomes_a_track_with_two_turnouts(piece):
     axis, frame, _, _ = piece
     rng = np.random.default_rng(5)
