@@ -14,8 +14,8 @@ It is one dictionary of JSON values in `model.provenance["build"]`; an unknown n
 - `receivers`: one entry a kind of receiver: `receiver`, `runs`, `offset_east_m`, `offset_north_m`, `sigma_east_m`, `sigma_north_m`
 - `datum`: `rule` (plain words), `observable` (bool), `sigma_east_m`, `sigma_north_m`
 - `tracks`: one entry a track: `track`, `length_m`, `runs` (identifiers), `sigma_cross_m` and `sigma_cross_95_m`, `unit_weight_rms`
-  (of the chain across: 1 where the weights are honest), `heights` (bool),
-  `survey_again`: list of {`from_m`, `to_m`, `sigma_m`, `reason`}
+  (of the chain across: 1 where weights are honest and errors white, less where errors of seconds stand as stronger white noise),
+  `heights` (bool), `survey_again`: list of {`from_m`, `to_m`, `sigma_m`, `reason`}
 - `verdicts`: every gross error (`railnav.survey.verdicts`): `total`, and `list` of up to 300
 - `repeatability`: one entry a kind of receiver: axes from single runs of different dates compared, as a histogram
   (`railnav.survey.repeatability`)

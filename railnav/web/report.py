@@ -210,7 +210,11 @@ def build_sections(build: Mapping[str, Any]) -> list[Section]:
         )
     ]
     columns, rows, left = track_rows(build)
-    sections.append(Section("The tracks", "", [Table(columns, rows[:200], left)]))
+    told = (
+        "Sigma across is that of the axis. Unit weight is the RMS of the whitened residuals: 1 where errors are as they are taken to be, "
+        "less where errors that last for seconds are carried as stronger noise."
+    )
+    sections.append(Section("The tracks", told, [Table(columns, rows[:200], left)]))
     sections += survey_sections(build)
     if build.get("warnings"):
         sections.append(Section("What to know about this build", "", [Warnings([str(w) for w in build["warnings"]])]))
