@@ -14,7 +14,14 @@ from railnav.monitoring.fitting.axis import Axis
 from railnav.monitoring.fitting.cant import FittedCant, fit_cant, law_of_ramps
 from railnav.monitoring.fitting.editing import Points, plan_sigmas, refined, tried
 from railnav.monitoring.fitting.laws import OTHER_LAWS, Law, owed_to_law, prior, under_law, with_laws, with_ramps
-from railnav.monitoring.fitting.noise import Resolution, likeliest, likeliest_smooth, resolution
+from railnav.monitoring.fitting.noise import (
+    WAVES_WORTH,
+    Resolution,
+    likeliest,
+    likeliest_smooth,
+    of_residuals,
+    resolution,
+)
 from railnav.monitoring.fitting.plan import PlanFit, chain_of_pieces, fit_plan
 from railnav.monitoring.fitting.profile import Profile, fit_profile
 from railnav.monitoring.fitting.rounding import round_design
@@ -30,6 +37,8 @@ IntArray = NDArray[np.int64]
 FLOOR = 5e-4
 #: A fit whose residuals are this many times the noise has failed.
 _FAILED = 5.0
+#: Steps that the last adjustment may take.
+_AT_LAST = 120
 #: An element this short is nothing, m.
 _STUB = 0.1
 #: And leaving it out is worth this, in -2 log likelihood.
@@ -160,6 +169,10 @@ def fit_design(
     points = Points(east, north, noise)
     fit = fit_plan(chain_of_pieces(pieces, along, ref), along, east, north, noise)
     fit = refined(_one_sided(fit, points), points, jump=jump)
+    if noise.correlated > 0.0 and not noise.smooth:
+        noise = of_residuals(fit.along, fit.residual, noise, floor=0.2 * FLOOR, stated=sigma)
+        points = Points(east, north, noise)
+        fit = refined(fit_plan(fit.chain, fit.along, east, north, noise), points, jump=jump)
     tell(label, 2, total)
     if noise.smooth:
         law = prior(laws) if (fit.chain.kind >= CLOTHOID).any() else Law({})
@@ -175,6 +188,8 @@ def fit_design(
     if len(fit.chain.kind) != len(whole.chain.kind):
         owed = owed_to_law(fit, law)
     tell(label, 3, total)
+    if not fit.settled:
+        fit = fit_plan(fit.chain, fit.along, east, north, noise, steps=_AT_LAST)
     if not fit.settled:
         warnings.append(f"track {axis.track}: the elements did not come to rest; their sigmas may be too small")
     if "or" in law.said.split():
@@ -303,17 +318,30 @@ def _segment(
     else:
         noise = likeliest(pieces, len(along), chosen.spacing, white, floor=FLOOR, stated=sigma)
     everything = slice(0, len(along))
-    best = pieces(noise, everything, segmentation.BEAM)
-    for begin in (segmentation.RAILWAY, segmentation.TRAMWAY):  # how this track is built tells what its pieces cost
-        prices = begin
-        for _ in range(3):
-            found = pieces(noise, everything, segmentation.BEAM, prices)
-            learnt = segmentation.learnt(found, len(along))
-            if found.cost < best.cost:
-                best = found
-            if np.allclose(learnt.of_rule, prices.of_rule, atol=0.5):
-                break
-            prices = learnt
+
+    def learnt(noise: Noise) -> tuple[float, Pieces]:
+        """Pieces under a noise, at prices that this track itself teaches, and what they cost."""
+        least: tuple[float, Pieces] | None = None
+        for prices in (segmentation.RAILWAY, segmentation.TRAMWAY):
+            for _ in range(3):
+                found = pieces(noise, everything, segmentation.BEAM, prices)
+                cost = segmentation.whole_cost(found, prices, len(along))
+                if least is not None and cost > least[0] - 0.5:
+                    break
+                least = cost, found
+                prices = segmentation.learnt(found, len(along))
+        if least is None:
+            raise EstimationError(f"track {axis.track}: no elements were found")
+        return least
+
+    cost, best = learnt(noise)
+    if (
+        noise.correlated > 0.0 and not noise.smooth
+    ):  # the whole track may know better than its samples that there are no waves
+        plain = Noise(white)
+        cost_plain, other = learnt(plain)
+        if cost_plain - cost + 2.0 * len(along) * float(np.log(white / np.mean(noise.sigma))) < WAVES_WORTH:
+            noise, best = plain, other
     return noise, best, ref, segmentation.rarity_of_jumps(segmentation.learnt(best, len(along)))
 
 

@@ -22,8 +22,9 @@ IntArray = NDArray[np.int64]
 NOTHING = 3.0
 #: A transition that bends the other way over less than this share of it does not.
 _HARDLY = 0.03
-#: Arcs less bent than this, 1/m, are not built, and what that weighs in -2 log likelihood.
-_WIDEST, _ODD = 1.0 / 40_000.0, 12.0
+#: Arcs less bent than this, 1/m, are hardly built, those less bent than that not at all, and what that weighs in -2 log likelihood.
+_WIDEST, _ODD = 1.0 / 40_000.0, 20.0
+_NO_ARC, _NOT_BUILT = 1.0 / 300_000.0, 200.0
 #: A transition is none within this many sigmas of its length.
 _NO_LENGTH = 2.0
 
@@ -194,7 +195,10 @@ def _without(items: list[Item], j: int, bend_sigma: FloatArray, length_sigma: Fl
         if before is not None and after is not None and max(before.kind, after.kind) < elements.CLOTHOID:
             if _same(before, after, bend_sigma[j - 1], bend_sigma[j + 1]):
                 length = before.length + item.length + after.length
-                return Edit(j - 1, j + 2, (replace(before, length=length),), 3)
+                bonus = (
+                    _ODD if before.kind == elements.STRAIGHT else 0.0
+                )  # no transition leads from a straight to itself
+                return Edit(j - 1, j + 2, (replace(before, length=length),), 3, bonus)
             if none:
                 pair = (
                     replace(before, length=before.length + half),
@@ -279,7 +283,8 @@ def hardly_bent(items: list[Item]) -> list[Edit]:
         lo, hi = max(j - 1, 0), min(j + 2, len(items))
         if item.kind != elements.ARC or abs(item.k0) > _WIDEST or (edits and edits[-1].last > lo):
             continue
-        edits.append(Edit(lo, hi, _straightened(items, j), 1, _ODD))
+        bonus = _NOT_BUILT if abs(item.k0) < _NO_ARC else _ODD
+        edits.append(Edit(lo, hi, _straightened(items, j), 1, bonus))
     return edits
 
 

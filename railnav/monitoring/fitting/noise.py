@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from railnav.monitoring.fitting.segmentation import Noise, Pieces
+from railnav.monitoring.fitting.segmentation import Noise, Pieces, unlikeliness
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -37,8 +37,10 @@ _STRIDES = (1.1, 0.5)
 _TRIALS = 32
 #: Longer waves bend no element: spacings, m.
 _LONGEST, _LONGEST_WAVE = 8.0, 120.0
+#: Residuals that tell the noise, at most.
+_RESIDUALS = 6000
 #: Waves must be likelier than none by this, in -2 log likelihood.
-_WORTH = 25.0
+WAVES_WORTH = 25.0
 #: Waves are at most this many times the white noise that differences a metre apart show: larger ones are the track's own.
 _LARGEST = 5.0
 
@@ -173,7 +175,7 @@ def likeliest(
                     if known[there] < known[place] - 0.5:
                         place, moved = there, True
                         break
-    if known[place] < least_plain - _WORTH:
+    if known[place] < least_plain - WAVES_WORTH:
         return noise_of(place)
     return plain
 
@@ -225,6 +227,42 @@ def likeliest_smooth(
                         break
                     place, moved = trial, True
     return noise_of(place)
+
+
+def of_residuals(along: FloatArray, residual: FloatArray, noise: Noise, *, floor: float, stated: float | None) -> Noise:
+    """The noise under which what is left of the points is likeliest, from a first guess.
+
+    Elements found, waves tell their size and length better than while elements are looked for.
+    """
+    from scipy.optimize import minimize
+
+    middle = (
+        slice(0, len(along))
+        if len(along) <= _RESIDUALS
+        else slice(*(len(along) // 2 + np.array([-1, 1]) * _RESIDUALS // 2))
+    )
+    place, off = along[middle], residual[middle]
+    spacing = float(np.median(np.diff(place)))
+
+    def of(logs: FloatArray) -> Noise:
+        white = max(float(np.exp(logs[0])), floor) if stated is None else stated
+        return Noise(
+            white, float(np.exp(logs[1])), float(np.clip(np.exp(logs[2]), spacing, _LONGEST_WAVE)), noise.smooth
+        )
+
+    first = np.log([float(np.mean(noise.sigma)), noise.correlated, noise.length])
+    found = minimize(
+        lambda logs: unlikeliness(place, off, of(logs)),
+        first,
+        method="Nelder-Mead",
+        options={
+            "maxfev": 120,
+            "xatol": 0.02,
+            "fatol": 0.1,
+            "initial_simplex": first + np.vstack([np.zeros(3), -0.7 * np.eye(3)]),
+        },
+    )
+    return of(found.x)
 
 
 def _cost_of(pieces: Callable[[Noise, slice], Pieces], count: int) -> Callable[[Noise], float]:

@@ -89,24 +89,56 @@ _ELSEWHERE = 4.0
 _CHEAPEST, _DEAREST_PLACE = 5.0, 14.0
 
 
-def learnt(pieces: Pieces, count: int) -> Prices:
-    """What pieces cost on a track of `count` points that is built like these."""
-    first = np.array([rule[0] for rule in _PLAN_RULES])
-    seen = np.array(
+def _seen(pieces: Pieces) -> FloatArray:
+    """How often each rule was followed."""
+    return np.array(
         [
             np.sum((pieces.live[:-1] == a) & (pieces.live[1:] == b) & (pieces.order[1:] == order))
             for a, b, order, _ in _PLAN_RULES
         ],
         np.float64,
     )
+
+
+def _usual() -> tuple[IntArray, FloatArray]:
+    """Kind of piece before, and weight of each rule elsewhere, in pieces."""
+    first = np.array([rule[0] for rule in _PLAN_RULES])
     usual = np.exp(-0.5 * RAILWAY.of_rule)
+    for kind in (STRAIGHT, ARC, TRANSITION):
+        usual[first == kind] *= _ELSEWHERE / usual[first == kind].sum()
+    return first, usual
+
+
+def learnt(pieces: Pieces, count: int) -> Prices:
+    """What pieces cost on a track of `count` points that is built like these."""
+    seen = _seen(pieces)
+    first, usual = _usual()
     of_rule = np.empty(len(seen))
     for kind in (STRAIGHT, ARC, TRANSITION):
         here = first == kind
-        share = seen[here] + _ELSEWHERE * usual[here] / usual[here].sum()
+        share = seen[here] + usual[here]
         of_rule[here] = -2.0 * np.log(share / share.sum())
     place = float(np.clip(2.0 * np.log(count / max(len(pieces.begin), 2)), _CHEAPEST, _DEAREST_PLACE))
     return Prices(place, of_rule)
+
+
+def whole_cost(pieces: Pieces, prices: Prices, count: int) -> float:
+    """-2 log likelihood of pieces found at some prices, with what it costs to say how this track is built.
+
+    What follows what is told by a Dirichlet distribution about how railways build: the first jump is dear, the twentieth cheap.
+    """
+    from scipy.special import gammaln
+
+    seen = _seen(pieces)
+    first, usual = _usual()
+    told = 0.0
+    for kind in (STRAIGHT, ARC, TRANSITION):
+        here = first == kind
+        told -= 2.0 * float(np.sum(gammaln(seen[here] + usual[here]) - gammaln(usual[here])))
+        told += 2.0 * float(gammaln(seen[here].sum() + _ELSEWHERE) - gammaln(_ELSEWHERE))
+    joints = len(pieces.begin) - 1
+    place = float(np.clip(2.0 * np.log(count / max(joints + 1, 2)), _CHEAPEST, _DEAREST_PLACE))
+    return pieces.cost - float(seen @ (prices.of_rule + prices.place)) + told + place * joints
 
 
 def rarity_of_jumps(prices: Prices) -> float:
@@ -332,6 +364,21 @@ def segment_cant(
         every,
         beam,
     )
+
+
+def unlikeliness(along: FloatArray, off: FloatArray, noise: Noise) -> float:
+    """-2 log likelihood of distances `off` (n,) at places under a noise, but for a constant."""
+    n = len(along)
+    zero = np.zeros(n)
+    white = np.broadcast_to(np.asarray(noise.sigma, np.float64) ** 2, (n,)).copy()
+    step = np.append(0.0, np.diff(along))
+    passing, colour = noise.passing(step)
+    none = np.zeros(n, bool)
+    _, cost = _kernels.segment(
+        step, np.ascontiguousarray(off), zero, zero, zero, white, passing, colour, none, np.array([1]),
+        np.zeros((0, 3), np.int64), np.zeros(0), np.array([1e-12]), 4, _MARGIN,
+    )  # fmt: skip
+    return float(cost + np.log(white).sum())
 
 
 def _run(
