@@ -241,7 +241,8 @@ def _merge(base: FloatArray, other: FloatArray) -> FloatArray | None:
         after = int(at[b]) if b < len(other) else None
         if before is not None and after is not None:
             if abs(after - before) <= 2:
-                inserts.append((min(before, after), piece if after >= before else piece[::-1]))
+                onward = piece if after >= before else piece[::-1]
+                inserts.append((_gap_for(base, onward, min(before, after), max(before, after)), onward))
                 accepted[a:b] = True
         else:
             touch = before if before is not None else after
@@ -262,6 +263,17 @@ def _merge(base: FloatArray, other: FloatArray) -> FloatArray | None:
     parts.append(base[previous:])
     merged = np.concatenate(parts)
     return np.asarray(merged[np.append(True, np.hypot(*np.diff(merged, axis=0).T) > 5.0)])
+
+
+def _gap_for(base: FloatArray, piece: FloatArray, first: int, last: int) -> int:
+    """Point of the course, near points first..last, after which a piece goes in with the least detour.
+
+    The nearest point may lie a step before the gap that the piece fills; a fold there would not be smoothed away.
+    """
+    at = np.arange(max(0, first - 1), min(len(base) - 2, last) + 1)
+    to, onward = base[at] - piece[0], base[at + 1] - piece[-1]
+    detour = np.hypot(*to.T) + np.hypot(*onward.T) - np.hypot(*(base[at + 1] - base[at]).T)
+    return int(at[np.argmin(detour)])
 
 
 def _densify(points: FloatArray) -> tuple[FloatArray, IntArray]:

@@ -306,3 +306,13 @@ def test_a_difference_of_frames_is_not_a_second_track():
     value, design = four_runs(0.0, 0.05, common=6.0)
     groups, _ = tracks_of_line(value, design, [""] * 4, [1] * 4, list("abcd"))
     assert groups == [[0, 1, 2, 3]]
+
+
+def test_a_gap_is_filled_without_a_fold_where_the_nearest_point_lies_a_step_before_it():
+    # as on a real line: both runs are blind between 3,000 and 3,800 m; one begins again a little earlier than the other
+    longer = np.concatenate([np.arange(0.0, 3020.0, 30.0), [3030.0], np.arange(3884.0, 6000.0, 30.0)])
+    other = np.concatenate([np.arange(8.0, 2999.0, 30.0), [3014.0], np.arange(3800.0, 5900.0, 30.0)])
+    (line,) = lines([np.column_stack([x, np.zeros(len(x))]) for x in (longer, other)])
+    assert line.members == [0, 1]
+    assert len(line.course) > len(longer)
+    assert (np.diff(line.course[:, 0]) > 0.0).all()
