@@ -633,7 +633,7 @@ def fix_all(fil, net, shared, bank, work, row):
         project(P_sqrt, h_north, f_north)
         absorb(x, P_sqrt, f_north, innovation, fix[3], keep, move)
         if tag == 0.0 and not timed(fil):
-            take_back(fil, x, P_sqrt, told, work.vector[W_COLUMN])
+            take_back(fil, x, P_sqrt, told, 1, work.vector[W_COLUMN])
     for i in range(count, bank.live[0]):  # a place that is wrong is as probable as a receiver that steps
         work.slot[bank.live[1 + i], S_SAID] = work.slot[bank.live[1 + i - count], S_SAID]
     # the evidence of positions fades: errors longer than any correlation time must not add up to certainty

@@ -24,6 +24,7 @@ from railnav.navigation.columns import (
     K_ODOMETER_SLIP,
     K_ODOMETER_WALK,
     K_SIDE_WALK,
+    K_SPEED_LATENCY,
     K_SPEED_TIME,
     K_TAG_WALK,
     KICK,
@@ -84,11 +85,21 @@ def transition(fil, x, dt, sign, force, rough, pull, slip, shake, step, tag, tra
         fade = math.exp(-dt / k[K_SPEED_TIME])
         F[i_e, i_e] = fade
         new[i_e] = fade * x[i_e]
+    c = 0
     i_t = at[TIME_TAG]
     if not timed(fil):  # nothing but the fixes tells the time: what the stamps jumped by is forgotten
         back = math.exp(-dt / TAG_MEMORY)
         F[i_t, i_t] = back
         new[i_t] = back * x[i_t]
+        i_l = at[SPEED_LATENCY]
+        if i_l >= 0:
+            F[i_l, i_l] = back
+            new[i_l] = back * x[i_l]
+            for j in range(n):
+                Q[c, j] = 0.0
+            Q[c, i_l] = k[K_SPEED_LATENCY] * math.sqrt(1.0 - back * back)
+            lead[c] = i_l
+            c += 1
     v = x[i_v]
     F[i_s, i_v] = dt
     i_a = at[ACCELERATION]
@@ -128,7 +139,6 @@ def transition(fil, x, dt, sign, force, rough, pull, slip, shake, step, tag, tra
         if i_f >= 0:
             F[i_d, i_f] = rate * F[i_s, i_f]
     # noise columns
-    c = 0
     for i in range(2):
         for j in range(n):
             Q[c, j] = 0.0
@@ -324,14 +334,14 @@ def stamps(fil, x, P_sqrt):  # -> shift of the stamps, its variance, age of the 
 
 
 @part
-def take_back(fil, x, P_sqrt, before, column):  # before: from `stamps`; (n,) scratch
+def take_back(fil, x, P_sqrt, before, states, column):  # before: from `stamps`; 1: the stamps, 2: the latency too; (n,) scratch
     """Take back what rows have told of stamps and latency, and keep what they told of the rest (consider states, Schmidt).
 
     With gain K, P+ = P - K S K^T; a state that is only considered has no gain of its own: its covariances with the others shrink as they
     would, its variance does not. That is the optimal update with K_i^2 S added to P_ii, and x_i as before. Estimated, both follow the
     noise of the very speeds and accelerations that they are multiplied by.
     """
-    for m in range(2):
+    for m in range(states):
         i = fil.at[TIME_TAG] if m == 0 else fil.at[SPEED_LATENCY]
         if i >= 0:
             lost = before[2 * m + 1] - variance_of(P_sqrt, i)
