@@ -119,6 +119,14 @@ PAGES = {
                 "python benchmarks/faults.py",
             ),
             Section(
+                "yardsticks",
+                "The peers' yardsticks: many turnouts, rough GNSS",
+                "Simulated: tracks 4.5 m apart, 1 Hz GNSS with 3 m white and 2 m coloured error, 194 turnouts. On such data the "
+                "nearest track is right in 69 % of epochs, FMM, Valhalla and OSRM in 79 to 86 % (with moves that no train can make), a "
+                "legal-path HMM with a 1 Hz gyro in 99.8 %; railpos errs 2.1 m along, with 46 to 61 % of errors inside its 95 % bound.",
+                "python benchmarks/yardsticks.py",
+            ),
+            Section(
                 "gaps",
                 "Gaps cut into a real line's runs",
                 "GNSS alone on a train: nothing else tells how fast it runs inside a gap.",

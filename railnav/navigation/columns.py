@@ -254,6 +254,8 @@ BALISE_REACH = 10.0
 BRIDGED = 3.0
 #: Mean error across of such a bridge, of its largest.
 HELD = 0.6
+#: Beyond this sigma along the track, m, a receiver alone that gives fixes has not yet told where on the track the train is.
+APART = 25.0
 #: Sigmas past a toe at which a turnout's leg may be declared.
 GUARD = 3.0
 #: Posterior below which a hypothesis that may not have reached a toe does not keep the others from being declared past it.

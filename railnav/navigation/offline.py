@@ -69,7 +69,8 @@ def navigate(
     Returns
     -------
     Solution
-        One row an epoch. `track_probability` is the posterior of the row's track; below 0.99 the mode is ambiguous.
+        One row an epoch. `track_probability` is the posterior of the row's track; below 0.99 the mode is ambiguous; so it is where the
+        fixes of a receiver alone have jumped and the place on the track is open (sigma beyond 25 m).
         `protection_level_along` bounds the error along the track over all hypotheses, also those on other tracks (their places are
         projected onto the row's track), so that it holds whichever track is right; that the track is right, it does not say.
         `alternatives` holds all candidates of the rows whose track is not certain (none when smoothed).

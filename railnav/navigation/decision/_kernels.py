@@ -22,6 +22,7 @@ from railnav.navigation.columns import (
     ACCELERATION,
     ACCELEROMETER_BIAS,
     AMBIGUOUS,
+    APART,
     C_FIX_TIME,
     C_NOTHING_NEAR,
     C_OUT_MODE,
@@ -234,9 +235,12 @@ def put_out(fil, net, shared, bank, work, row, out):
     if at[WHEEL_DISTANCE] >= 0:
         out[OUT_LEVEL] = max(out[OUT_LEVEL], separation_bound(fil, bank, h, row[TIME]))
     out[OUT_DIRECTION] = way if forward >= DIRECTION_CONFIDENCE * standing else 0.0
-    if probability < k[K_CONFIDENCE] or at_a_toe(fil, shared.weight, bank, h):
+    aged = row[TIME] - common[C_FIX_TIME] > k[K_COASTING]
+    # fixes come, but have jumped: whether the receiver or the place was wrong is open
+    jumped = not aged and variance > APART * APART and at[ACCELERATION] >= 0 and at[WHEEL_DISTANCE] < 0
+    if probability < k[K_CONFIDENCE] or jumped or at_a_toe(fil, shared.weight, bank, h):
         out[OUT_MODE] = AMBIGUOUS
-    elif row[TIME] - common[C_FIX_TIME] > k[K_COASTING]:
+    elif aged:
         out[OUT_MODE] = COASTING
     else:
         out[OUT_MODE] = TRACKING

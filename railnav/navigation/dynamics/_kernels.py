@@ -334,7 +334,9 @@ def stamps(fil, x, P_sqrt):  # -> shift of the stamps, its variance, age of the 
 
 
 @part
-def take_back(fil, x, P_sqrt, before, states, column):  # before: from `stamps`; 1: the stamps, 2: the latency too; (n,) scratch
+def take_back(
+    fil, x, P_sqrt, before, states, column
+):  # before: from `stamps`; 1: the stamps, 2: the latency too; (n,) scratch
     """Take back what rows have told of stamps and latency, and keep what they told of the rest (consider states, Schmidt).
 
     With gain K, P+ = P - K S K^T; a state that is only considered has no gain of its own: its covariances with the others shrink as they

@@ -376,7 +376,9 @@ def log_once(variance, shared_part, alike):
 
 
 @part
-def somewhere(innovation, variance, counts, once):  # (>= 5,) by Gauss-Hermite node -> -2 ln p of a mixture over the place
+def somewhere(
+    innovation, variance, counts, once
+):  # (>= 5,) by Gauss-Hermite node -> -2 ln p of a mixture over the place
     """What a reading says of a hypothesis that does not know its place well: it fits if it fits anywhere there (15.4 over 19.3's nodes).
 
     The misfit of the node that fits best counts with every row; at which nodes it does not fit tells of the place, not of the track, and
