@@ -151,6 +151,9 @@ def settled(
 ) -> tuple[stretches.StretchesFit, FloatArray]:
     """The fit without pieces shorter than their sigmas or alike on both sides, and sigmas (m, states + 2) of its unknowns."""
     refused: set[float] = set()
+    # what the values as first found scatter by; it must not grow with what is left out
+    size = float(np.clip(fitted.cost / max(len(along) - 2 * len(fitted.stretches.begin), 1), 1e-3, 1.0))
+    size *= _again(noise, along)
     for _ in range(_MOST_DROPPED):
         true = noise_of_stretches(fitted, noise, sigma, per_point)
         each = stretch_sigmas(fitted, along, true, per_point)
@@ -170,8 +173,7 @@ def settled(
         except EstimationError:
             refused.add(round(float(s.begin[j]), 3))
             continue
-        size = max(fitted.cost / max(len(along) - 2 * len(s.begin), 1), 1e-3) * _again(noise, along)
-        if again.cost > fitted.cost + _DEARER * size * 2.0:
+        if again.cost > fitted.cost + _DEARER * size:
             refused.add(round(float(s.begin[j]), 3))
         else:
             fitted = again

@@ -54,7 +54,7 @@ _PROFILE_RULES = (
     (GRADE, CURVE, 2, 0.0),
     (CURVE, GRADE, 2, 0.0),
     (CURVE, CURVE, 2, 0.0),
-    (GRADE, GRADE, 1, 2.5 * _JUMP_PRICE),
+    (GRADE, GRADE, 1, _JUMP_PRICE),
 )
 _CANT_RULES = (
     (LEVEL, RAMP, 1, 0.0),

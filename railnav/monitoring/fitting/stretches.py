@@ -21,6 +21,8 @@ IntArray = NDArray[np.int64]
 
 _MOST_STEPS = 30
 _SETTLED = 1e-4
+#: How often a step is taken again, shorter.
+_HALVED = 7
 #: A place moves by no more than this share of the shorter piece beside it in a step.
 _STRIDE = 0.4
 
@@ -110,12 +112,20 @@ def fit_stretches(
     stretches = replace(stretches, state=state)
     robust = np.ones(len(y))
     settled = False
+    stretches, robust, cost = _filled(stretches, along, y, sigma, robust)
     for count in range(steps):
         solution = _solved(stretches, along, y, sigma, robust)
-        stretches, moved = _stepped(stretches, solution)
-        owner, x = _owners(stretches, along)
-        ratio = np.abs(y - _value(stretches, owner, x, 0)) / sigma
-        robust = np.where(ratio > ROBUST, ROBUST / np.maximum(ratio, ROBUST), 1.0)
+        share = 1.0
+        for _ in range(_HALVED):  # places that lead away are moved less
+            trial, moved = _stepped(stretches, share * solution)
+            trial, trial_robust, trial_cost = _filled(trial, along, y, sigma, robust)
+            if trial_cost <= cost * (1.0 + 1e-9) + 1e-3:
+                break
+            share *= 0.4
+        else:
+            settled = True  # nothing better nearby
+            break
+        stretches, robust, cost = trial, trial_robust, trial_cost
         if moved < _SETTLED and count > 2:
             settled = True
             break
@@ -134,6 +144,23 @@ def unknowns(stretches: Stretches) -> int:
 # --- within -----------------------------------------------------------------------------------------------------------
 
 
+def _filled(
+    stretches: Stretches, along: FloatArray, y: FloatArray, sigma: FloatArray, robust: FloatArray
+) -> tuple[Stretches, FloatArray, float]:
+    """The best values of pieces whose places stay, robust weights, and Huber's sum."""
+    m, k = stretches.state.shape
+    for _ in range(2):
+        solution = _solved(stretches, along, y, sigma, robust, stay=True)
+        own = solution[: (k + 2) * m].reshape(m, k + 2)
+        top = stretches.top + np.where(stretches.bent, own[:, k + 1], 0.0)
+        stretches = replace(stretches, state=stretches.state + own[:, :k], top=top)
+        owner, x = _owners(stretches, along)
+        ratio = np.abs(y - _value(stretches, owner, x, 0)) / sigma
+        robust = np.where(ratio > ROBUST, ROBUST / np.maximum(ratio, ROBUST), 1.0)
+    square = np.where(ratio > ROBUST, ROBUST * (2.0 * ratio - ROBUST), ratio**2)
+    return stretches, robust, float(square.sum())
+
+
 def _owners(stretches: Stretches, along: FloatArray) -> tuple[IntArray, FloatArray]:
     owner = np.clip(np.searchsorted(stretches.begin, along, side="right") - 1, 0, len(stretches.begin) - 1)
     return owner, along - stretches.begin[owner]
@@ -150,7 +177,13 @@ def _value(stretches: Stretches, owner: IntArray, x: FloatArray, derivative: int
 
 
 def _equations(
-    stretches: Stretches, along: FloatArray, y: FloatArray, sigma: FloatArray, robust: FloatArray, damping: float = 0.0
+    stretches: Stretches,
+    along: FloatArray,
+    y: FloatArray,
+    sigma: FloatArray,
+    robust: FloatArray,
+    damping: float = 0.0,
+    stay: bool = False,
 ) -> tuple[FloatArray, Any, Any, FloatArray]:
     from scipy import sparse
 
@@ -206,8 +239,9 @@ def _equations(
             if i > 0:
                 put(r, per * i + k, -gain)
             rest.append(float(stretches.state[j, p] - passed[p][i]))
-    put(len(rest), k, 1.0)  # the first begin stays
-    rest.append(0.0)
+    for j in range(m if stay else 1):  # the first begin stays in any case
+        put(len(rest), per * j + k, 1.0)
+        rest.append(0.0)
     for j in np.flatnonzero(~stretches.bent).tolist():
         put(len(rest), per * j + k + 1, 1.0)
         rest.append(0.0)
@@ -221,12 +255,12 @@ def _equations(
 
 
 def _solved(
-    stretches: Stretches, along: FloatArray, y: FloatArray, sigma: FloatArray, robust: FloatArray
+    stretches: Stretches, along: FloatArray, y: FloatArray, sigma: FloatArray, robust: FloatArray, *, stay: bool = False
 ) -> FloatArray:
     """The step; equations without a solution are damped until they have one."""
     damping = 0.0
     for _ in range(6):
-        _, _, kkt, rhs = _equations(stretches, along, y, sigma, robust, damping)
+        _, _, kkt, rhs = _equations(stretches, along, y, sigma, robust, damping, stay)
         try:
             solution: FloatArray = _factor(kkt).solve(rhs)
         except EstimationError:
