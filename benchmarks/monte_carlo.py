@@ -20,6 +20,7 @@ import numpy as np
 import railnav as rn
 from railnav.evaluation import compare, evaluate, pooled
 from railnav.evaluation.reliability import binomial_bounds, pooled_reliability, reliability
+from railnav.navigation import Settings
 from railnav.simulation import SERVICE, Driving, GnssSensor, Leg, OdometerSensor, Outfit, demo_line, simulate
 from railnav.track.model import NodeKind, TrackModel
 
@@ -29,6 +30,20 @@ WHITE = GnssSensor(
 )
 #: 1.5 m in all, most of it coloured over a minute: what receivers do.
 COLOURED = GnssSensor()
+#: A navigator told of the first: white fixes, exact stamps, no latency, inertial sensors as good as this simulation's.
+TOLD = Settings(
+    gnss_correlated_share=1e-3,
+    gnss_white_share=1.0,
+    gnss_frame_share=0.0,
+    speed_error_share=1e-3,
+    time_tag_sigma=1e-4,
+    time_tag_walk=1e-6,
+    accelerometer_noise=1.6e-3,
+    accelerometer_walk=1e-4,
+    gyro_scale=1e-3,
+    gyro_floor=5e-5,
+    speed_latency=0.01,
+)
 
 
 def rms(values: list[float] | np.ndarray) -> float:
@@ -45,21 +60,25 @@ def share(count: int, of: float) -> str:
 def open_sky(line: TrackModel, scale: float) -> dict[str, Any]:
     """GNSS 1.5 m, odometer, IMU; seven kilometres with curves."""
     found: dict[str, Any] = {}
-    for name, gnss in (("white", WHITE), ("coloured", COLOURED)):
+    for name, gnss, told in (
+        ("white, told so", WHITE, TOLD),
+        ("white", WHITE, None),
+        ("coloured", COLOURED, None),
+    ):
         parts, along, speed = [], [], []
-        for seed in range(max(3, int(30 * scale))):
+        for seed in range(40_000, 40_000 + max(3, int(60 * scale))):
             outfit = replace(SERVICE, gnss=gnss, odometer=replace(SERVICE.odometer, slip_rate=0.0))
             run, truth = simulate(
                 line, Leg(("77R-03",), start=200.0, finish=9500.0), seed=seed, outfit=outfit, tunnels=False
             )
-            e = evaluate(rn.navigate(run, line), truth)
+            e = evaluate(rn.navigate(run, line, settings=told), truth)
             late = e.time > 60.0
             parts.append(e.consistency)
             along.append(rms(e.along[late]))
             speed.append(rms(e.speed[late]))
         c = pooled(parts)
         print(
-            f"open sky, GNSS 1.5 m {name:8s} + odometer + IMU: along {rms(along):.3f} m RMS (bar 0.25), speed {rms(speed):.4f} m/s "
+            f"open sky, GNSS 1.5 m {name:14s} + odometer + IMU: along {rms(along):.3f} m RMS (bar 0.25), speed {rms(speed):.4f} m/s "
             f"(bar 0.02), NEES {c.nees:.2f} (bar 0.9 to 1.1; honest between {c.lower:.2f} and {c.upper:.2f})"
         )
         found[name] = {"along_rms_m": rms(along), "speed_rms_m_s": rms(speed), "nees": c.nees, "runs": len(parts)}
@@ -305,7 +324,7 @@ def odometry(line: TrackModel, scale: float) -> dict[str, Any]:
         run, truth = simulate(
             line,
             Leg(("77R-03",), start=200.0, finish=8000.0),
-            seed=7000 + seed,
+            seed=52_000 + seed,
             outfit=outfit,
             tunnels=False,
             outages=[(120.0, 1e5)],

@@ -57,6 +57,9 @@ from railnav.navigation.columns import (
     BALISE_TRACK,
     BLIND_LENGTH,
     BRIDGED,
+    C_ALONG,
+    C_ALONG_SIGMA,
+    C_ALONG_TIME,
     C_BALISE_TIME,
     C_BALISES,
     C_DISTRUST,
@@ -558,6 +561,18 @@ def doubt_places(fil, bank, work):
 
 
 @part
+def note_along(shared, bank, work, time):
+    """Note how far ahead of the heaviest hypothesis a fix lies: a witness of wheels that slip."""
+    h = heaviest(bank)
+    fix = work.fix[h]
+    te, tn = work.point[h, P_D_EAST], work.point[h, P_D_NORTH]
+    size = math.hypot(te, tn)
+    shared.common[C_ALONG] = (fix[0] * te + fix[1] * tn) / size
+    shared.common[C_ALONG_SIGMA] = math.sqrt(fix[4] * te * te + 2.0 * fix[6] * te * tn + fix[5] * tn * tn) / size
+    shared.common[C_ALONG_TIME] = time
+
+
+@part
 def fix_all(fil, net, shared, bank, work, row):
     """Let a GNSS position into every hypothesis, or hold it as suspect when it fits none; gives whether it was let in."""
     k = fil.settings
@@ -572,6 +587,7 @@ def fix_all(fil, net, shared, bank, work, row):
         work.slot[h, S_NIS] = nis
         work.slot[h, S_SAID] = logdet
         least = min(least, nis)
+    note_along(shared, bank, work, time)
     step = 0.0
     tag = 0.0
     if least > k[K_GATE] and not fresh:

@@ -93,6 +93,7 @@ K_CURVATURE_SHIFT = SETTING["curvature_shift"]
 K_CURVATURE_LENGTH = SETTING["curvature_length"]
 K_CURVATURE_DOUBT = SETTING["curvature_doubt"]
 K_COURSE_DOUBT = SETTING["course_doubt"]
+K_ODOMETER_SCALE = SETTING["odometer_scale"]
 K_ODOMETER_WALK = SETTING["odometer_scale_walk"]
 K_ODOMETER_SIGMA = SETTING["odometer_sigma"]
 K_ODOMETER_SLIP = SETTING["odometer_slip"]
@@ -213,11 +214,14 @@ OUTPUT_SIZE = 13
     C_ACCELEROMETER_FAULTS,
     C_ODOMETER_FAULTS,
     C_BLAMED,  # when wheel and receiver agreed against the accelerometer
+    C_ALONG,  # how far ahead of the heaviest hypothesis the latest fix lay, m, with its sigma, and when
+    C_ALONG_SIGMA,
+    C_ALONG_TIME,
     C_BLAMED_WAY,  # how far it may have carried the train astray by then, m
     C_RESCALED,  # when the receiver confirmed the speed against the wheel for long
     C_MISFIT,  # squared normalised innovation of fixes a degree of freedom, of late
-) = range(58)
-COMMON_SIZE = 58
+) = range(61)
+COMMON_SIZE = 61
 #: Innovations of fixes are judged over so many; their sigmas are too small where the mean square exceeds this.
 MISFIT_FIXES, MISFIT_USUAL = 20.0, 1.4
 #: How often tracks nearby that no hypothesis holds are given a rival, s.
@@ -267,6 +271,10 @@ COAST_LONGEST = 300.0
 ESTABLISHED = 60.0
 #: Yaw rates are no longer believed when this share of those of some seconds fits no hypothesis; and for how long then, s.
 YAW_MISFIT, YAW_SPAN, YAW_DISTRUST = 0.5, 2.0, 60.0
+#: A wheel contradicts the receiver from this difference of their speeds on: m/s, and a share of the speed; and a second of acceleration.
+CONTRADICTS, CONTRADICTS_SHARE = 0.5, 0.02
+#: A wheel whose scale seems to be off by more than this many sigmas is slipping, slowly.
+SCALE_GATE = 3.5
 #: A receiver's speed that the wheel confirms is against the filter's from this difference on, m/s: the former may be half a second old, but
 #: then a slipping wheel errs the other way.
 AGAINST = 0.4

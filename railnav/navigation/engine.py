@@ -154,7 +154,16 @@ class Engine:
             np.zeros(SLOTS, np.int64),
         )
         common = np.zeros(c.COMMON_SIZE)
-        never = [c.C_TIME, c.C_FIX_TIME, c.C_TRY, c.C_WHEEL_SEEN, c.C_GNSS_SPEED_TIME, c.C_DISTRUST, c.C_BALISE_TIME]
+        never = [
+            c.C_TIME,
+            c.C_FIX_TIME,
+            c.C_TRY,
+            c.C_WHEEL_SEEN,
+            c.C_GNSS_SPEED_TIME,
+            c.C_DISTRUST,
+            c.C_BALISE_TIME,
+            c.C_ALONG_TIME,
+        ]
         common[[*never, c.C_YAW_DISTRUST, c.C_BLAMED, c.C_RESCALED]] = -np.inf
         common[[c.C_WHEEL_MOVED, c.C_GNSS_STILL]] = np.inf
         common[c.C_SCALE] = self.settings.scale_start

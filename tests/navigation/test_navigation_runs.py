@@ -464,9 +464,11 @@ def test_inputs_are_left_alone(service, line):
 def test_consistency_over_seeded_runs(line):
     """NEES along the track of GNSS and odometer with the errors that are assumed: near 1 over runs, hardly ever beyond the level."""
     honest = GnssSensor(white_horizontal=0.5, coloured_horizontal=1.8, correlation_time=60.0, speed_sigma=0.05)
-    outfit = replace(WITH_ODOMETER, gnss=honest)
     squares, beyond, rows = [], 0, 0
     for seed in range(16):
+        # the constant part that is assumed, too
+        east, north = 0.3 * honest.sigma_horizontal * np.random.default_rng([seed, 1]).standard_normal(2)
+        outfit = replace(WITH_ODOMETER, gnss=replace(honest, frame_offset=(float(east), float(north), 0.0)))
         run, truth = simulate(
             line, Leg(("77R-03",), start=300.0, finish=6000.0), seed=seed, outfit=outfit, tunnels=False
         )
@@ -525,3 +527,22 @@ def test_sample_run_meets_its_figures(shared_data):
         assert sure.mean() > (0.99 if smooth else 0.9)
         assert (np.abs(along[counts]) < solution.protection_level_along[counts]).all()
         assert unlawful(solution, model) == []
+
+
+@pytest.mark.parametrize("seed", [7247, 50699])
+def test_a_slow_slip_is_no_scale_and_a_wild_one_no_speed(line, seed):
+    """A wheel that slips by 6 % for half a minute passed for one of another diameter, one that slips by 40 % for the speed."""
+    outfit = replace(
+        SERVICE,
+        imu=None,
+        gnss=GnssSensor(),
+        odometer=replace(SERVICE.odometer, interval=0.2, slip_rate=30.0, slip_size=0.15, slip_duration=5.0),
+    )
+    leg = Leg(("77R-03",), start=200.0, finish=8000.0)
+    run, truth = simulate(line, leg, seed=seed, outfit=outfit, tunnels=False, outages=[(120.0, 1e5)])
+    solution = navigate(run, line)
+    along, counts, _ = errors(solution, truth, line)
+    alone = counts & (solution.time > 120.0)
+    gone = np.abs(solution.offset - solution.offset[np.argmax(alone)])
+    assert (np.abs(along[alone]) < 5.0 + 0.05 * gone[alone]).all()
+    assert solution.diagnostics["wheel_slips"] >= 1

@@ -50,6 +50,9 @@ from railnav.navigation.columns import (
     BEND_CHANGE,
     BLIND_LENGTH,
     C_ACCELEROMETER_FAULTS,
+    C_ALONG,
+    C_ALONG_SIGMA,
+    C_ALONG_TIME,
     C_BLAMED,
     C_BLAMED_WAY,
     C_DISTRUST,
@@ -64,7 +67,10 @@ from railnav.navigation.columns import (
     C_SIGMA_NORTH,
     C_SLIPS,
     C_SPEED_STALE,
+    C_SUSPECTS,
     C_YAW_DISTRUST,
+    CONTRADICTS,
+    CONTRADICTS_SHARE,
     COURSE_EAST,
     COURSE_NORTH,
     DEAD_WHEEL,
@@ -93,6 +99,7 @@ from railnav.navigation.columns import (
     K_GRAVITY,
     K_GYRO_FLOOR,
     K_GYRO_SCALE,
+    K_ODOMETER_SCALE,
     K_ODOMETER_SIGMA,
     K_ODOMETER_SPEED,
     K_SIDE_NOISE,
@@ -114,6 +121,7 @@ from railnav.navigation.columns import (
     S_COURSE,
     S_STRETCH,
     S_YAW,
+    SCALE_GATE,
     SCALE_STEP,
     SHAKE_SPEED,
     SIDE,
@@ -129,6 +137,7 @@ from railnav.navigation.columns import (
     SPEED,
     SPEED_ERROR,
     SPEED_LATENCY,
+    STEP_MOST,
     STRANGE_BALISE,
     TIME,
     TIME_TAG,
@@ -245,6 +254,25 @@ def against_speed(shared, time, wheel, speed):
 
 
 @part
+def contradicted(fil, shared, bank, h, time, wheel):
+    """Difference of the receiver's speed from the wheel's, where its fixes too fall away from where the wheel has the train; else 0."""
+    common = shared.common
+    told = common[C_GNSS_SPEED]
+    fresh = common[C_GNSS_SPEED_TIME] > time - 1.5 and common[C_SPEED_STALE] == 0.0 and time > common[C_DISTRUST]
+    believable = common[C_SUSPECTS] == 0.0 and abs(common[C_ALONG]) < STEP_MOST
+    if not (fresh and believable and common[C_ALONG_TIME] > time - 1.5):
+        return 0.0
+    away = told - wheel
+    i_a = fil.at[ACCELERATION]
+    pulls = abs(bank.x[h, i_a]) if i_a >= 0 else 0.5
+    if abs(away) < CONTRADICTS + CONTRADICTS_SHARE * wheel + pulls:
+        return 0.0
+    ahead = common[C_ALONG] if bank.x[h, fil.at[SPEED]] >= 0.0 else -common[C_ALONG]
+    ahead = ahead if away > 0.0 else -ahead
+    return away if ahead > max(2.0 * abs(away), 2.0 * common[C_ALONG_SIGMA]) else 0.0
+
+
+@part
 def wheel_row(fil, shared, bank, work, h, row, leader):
     """Odometer distance: a slipping wheel is forgotten until it agrees with the speed again. Gives ln p, slip and shake variances.
 
@@ -275,6 +303,7 @@ def wheel_row(fil, shared, bank, work, h, row, leader):
         differs = abs(wheel - expected) > k[K_SLIP_GATE] * sigma
         agrees = abs(wheel - expected) < 0.1 + 1.5 * sigma
     shake = 0.0
+    away = 0.0
     info = bank.info[h]
     longest = False
     if h != leader:
@@ -284,7 +313,11 @@ def wheel_row(fil, shared, bank, work, h, row, leader):
             info[SLIP_SINCE] = bank.info[leader, SLIP_SINCE]
             info[AGREE_SINCE] = bank.info[leader, AGREE_SINCE]
     elif info[SLIP_SINCE] == -np.inf:
+        away = contradicted(fil, shared, bank, h, time, abs(wheel)) if span > 0.0 else 0.0
         begins = abs(innovation) > k[K_SLIP_GATE] * math.sqrt(s) or differs
+        if not begins and abs(x[at[ODOMETER_SCALE]]) > SCALE_GATE * k[K_ODOMETER_SCALE]:
+            begins = shared.common[C_RESCALED] == -np.inf
+        begins = begins or away != 0.0
     elif at[ACCELEROMETER_BIAS] >= 0 and span > 0.0 and against_speed(shared, time, wheel, x[i_v]):
         begins = False  # wheel and receiver agree: it is the accelerometer that is wrong
         shared.common[C_BLAMED_WAY] = abs(wheel - abs(x[i_v])) * (time - info[SLIP_SINCE])
@@ -315,11 +348,25 @@ def wheel_row(fil, shared, bank, work, h, row, leader):
             info[AGREE_SINCE] = np.inf
     if begins:
         info[SLIP_SINCE] = time
+        if abs(x[at[ODOMETER_SCALE]]) > SCALE_GATE * k[K_ODOMETER_SCALE] and shared.common[C_RESCALED] == -np.inf:
+            # a slow slip that passed for a scale: forget it, and take the wheel for what it was
+            widen(P_sqrt, at[ODOMETER_SCALE], SCALE_STEP, column)
+            for j in range(x.shape[0]):
+                h_row[j] = 0.0
+            h_row[at[ODOMETER_SCALE]] = 1.0
+            project(P_sqrt, h_row, f)
+            absorb(x, P_sqrt, f, -x[at[ODOMETER_SCALE]], k[K_ODOMETER_SCALE] ** 2, keep, move)
+            h_row[at[ODOMETER_SCALE]] = 0.0
+            h_row[i_d] = 1.0
         info[AGREE_SINCE] = np.inf
         if h == leader:
             shared.common[C_SLIPS] += 1.0
-        shake = SHAKE_SPEED * SHAKE_SPEED  # what the slip has already done
-        widen(P_sqrt, i_v, SHAKE_SPEED, column)
+        done = max(SHAKE_SPEED, abs(away))  # what the slip has already done
+        shake = done * done
+        widen(P_sqrt, i_v, done, column)
+        if away != 0.0:
+            widen(P_sqrt, at[POSITION], shared.common[C_ALONG], column)
+            work.slot[h, S_STRETCH] += shared.common[C_ALONG] ** 2
         if i_a >= 0:
             widen(P_sqrt, i_a, KICK, column)
     elif longest:  # then it is the speed that is wrong
