@@ -73,7 +73,7 @@ def navigate(
         fixes of a receiver alone have jumped and the place on the track is open (sigma beyond 25 m).
         `protection_level_along` bounds the error along the track over all hypotheses, also those on other tracks (their places are
         projected onto the row's track), so that it holds whichever track is right; that the track is right, it does not say.
-        `alternatives` holds all candidates of the rows whose track is not certain (none when smoothed).
+        `alternatives` holds all candidates of the rows whose track is not certain; smoothed ones when smoothed.
         `sigma_cross` is the model's, or 0.5 m where the model states none (diagnostics: sigma_cross_assumed).
 
     Raises
@@ -126,8 +126,9 @@ def navigate(
     if explain is not None:
         explain += decisions(engine, table[:, c.TIME], out)
     if smooth:
-        out = smooth_rows(engine, table, out, progress=progress)
-    return _solution(run, engine, table, out, smooth)
+        out, others = smooth_rows(engine, table, out, progress=progress)
+        return _solution(run, engine, table, out, smooth, others)
+    return _solution(run, engine, table, out, smooth, alternatives(engine))
 
 
 def _distance_from(run: Run, model: TrackModel, table: FloatArray, sigma_usable: float) -> str:
@@ -146,7 +147,9 @@ def _distance_from(run: Run, model: TrackModel, table: FloatArray, sigma_usable:
     return f"run {run.id!r} never touches the model: its nearest fix lies {text} from the nearest track; is it the right model?"
 
 
-def _solution(run: Run, engine: Engine, table: FloatArray, out: FloatArray, smooth: bool) -> Solution:
+def _solution(
+    run: Run, engine: Engine, table: FloatArray, out: FloatArray, smooth: bool, others: Alternatives
+) -> Solution:
     """Turn the kernel's table into a solution: geometry, chainage and geodetic coordinates in bulk."""
     model = engine.model
     m = len(out)
@@ -209,7 +212,7 @@ def _solution(run: Run, engine: Engine, table: FloatArray, out: FloatArray, smoo
         smoothed=smooth,
         simulated=run.simulated,
         diagnostics=_diagnostics(engine, mode, assumed),
-        alternatives=Alternatives.none() if smooth else alternatives(engine),
+        alternatives=others,
     )
 
 

@@ -118,3 +118,22 @@ def test_a_crossover_in_a_long_gap_is_not_ruled_out_before_its_toe():
         over = np.array([truth.track_id[t] == "L1" for t in c.true_track]) & (c.time < 200.0)
         assert c.right[over & sure].all()
         assert c.right[over].mean() > 0.99
+
+
+def test_a_smoothed_solution_names_the_candidates_too(line):
+    """Two tracks side by side, no turnout, a receiver alone: rows that are not certain list both, and their probabilities add up."""
+    run, _ = simulate(
+        line, Leg(("77R-03",), start=300.0, finish=2500.0), seed=3, outfit=Outfit("gnss", gnss=ROUGH), tunnels=False
+    )
+    solution = navigate(run, line, smooth=True)
+    others = solution.alternatives
+    open_rows = np.flatnonzero((solution.track_probability < 0.999) & (solution.track >= 0))
+    assert len(open_rows) > 10
+    for row in open_rows[::10].tolist():
+        here = others.row == row
+        assert here.sum() >= 2
+        assert 0.98 < others.probability[here].sum() < 1.0 + 1e-9
+        assert (np.diff(others.probability[here]) <= 0.0).all()
+        own = here & (others.track == solution.track[row])
+        assert others.probability[own].sum() == pytest.approx(solution.track_probability[row], abs=1e-3)
+        assert np.abs(others.offset[own] - solution.offset[row]).min() < 20.0

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from railnav.navigation import columns as c
 from railnav.navigation.smoothing import _kernels as kernel
-from railnav.navigation.solution import Mode
+from railnav.navigation.solution import Alternatives, Mode
 from railnav.navigation.state import State
 from railnav.run import Progress
 
@@ -22,7 +22,13 @@ IntArray = NDArray[np.int64]
 __all__ = ["smooth_rows"]
 
 
-def smooth_rows(engine: Engine, table: FloatArray, out: FloatArray, *, progress: Progress | None = None) -> FloatArray:
+#: Candidates below this posterior are not told.
+LEAST = 1e-4
+
+
+def smooth_rows(
+    engine: Engine, table: FloatArray, out: FloatArray, *, progress: Progress | None = None
+) -> tuple[FloatArray, Alternatives]:
     """Put smoothed rows in the place of filtered ones.
 
     Each unbroken stretch of hypotheses is smoothed along the lineage of its last winner, the last stretch first. A row's track
@@ -42,6 +48,8 @@ def smooth_rows(engine: Engine, table: FloatArray, out: FloatArray, *, progress:
     Returns
     -------
     (m, OUTPUT_SIZE) array
+    Alternatives
+        Candidates of the rows whose track is not certain: where each final hypothesis, smoothed along its own past, has the train then.
     """
     out = out.copy()
     records, fil = engine.records, engine.filter
@@ -52,6 +60,9 @@ def smooth_rows(engine: Engine, table: FloatArray, out: FloatArray, *, progress:
     chain, other = np.full(m, -1, np.int64), np.full(m, -1, np.int64)
     track, way, standing, rival = (np.empty(m, np.int64) for _ in range(4))
     offset = np.empty(m)
+    told: dict[tuple[int, int, int], tuple[float, float]] = {}  # row, track, way: posterior, posterior times offset
+    elsewhere, way_there, offset_there = np.empty(m, np.int64), np.empty(m, np.int64), np.empty(m)
+    x_there, sigma_there = np.empty((m, n)), np.empty((m, 2))
     end = used
     while end > 0:
         last = int(epoch_of[end - 1])
@@ -69,7 +80,18 @@ def smooth_rows(engine: Engine, table: FloatArray, out: FloatArray, *, progress:
             begin = int(kernel.lineage(records, record, other))
             kernel.tracks_of(fil, records, other, begin, last, rival)
             begin = max(begin, first)
-            probability[begin - first :] += w * (rival[begin : last + 1] == standing[begin : last + 1])
+            same = rival[begin : last + 1] == standing[begin : last + 1]
+            probability[begin - first :] += w * same
+            rows_apart = begin + np.flatnonzero(~same)
+            if w >= LEAST and len(rows_apart):
+                kernel.smooth_lineage(fil, records, table, other, begin, last, x_there, sigma_there)
+                kernel.place(
+                    fil, engine.network.length, records, other, begin, last, x_there, elsewhere, way_there, offset_there
+                )
+                for row in rows_apart.tolist():
+                    key = (row, int(elsewhere[row]), int(way_there[row]))
+                    before = told.get(key, (0.0, 0.0))
+                    told[key] = (before[0] + w, before[1] + w * float(offset_there[row]))
         out[rows, c.OUT_TRACK] = track[rows]
         out[rows, c.OUT_WAY] = way[rows]
         out[rows, c.OUT_DIRECTION] = way[rows]
@@ -83,12 +105,26 @@ def smooth_rows(engine: Engine, table: FloatArray, out: FloatArray, *, progress:
         coasting = out[rows, c.OUT_FIX_AGE] > engine.settings.coasting_after
         decided = np.where(coasting, Mode.COASTING, Mode.TRACKING)
         out[rows, c.OUT_MODE] = np.where(probability < engine.settings.track_confidence, Mode.AMBIGUOUS, decided)
+        for row in (first + np.flatnonzero(probability < 1.0 - LEAST)).tolist():
+            key, p = (row, int(track[row]), int(way[row])), float(probability[row - first])
+            before = told.get(key, (0.0, 0.0))
+            told[key] = (before[0] + p, before[1] + p * float(offset[row]))
         end = int(np.searchsorted(epoch_of, first, side="left"))
         if progress is not None:
             progress("smooth", m - first, m)
     if progress is not None:
         progress("smooth", m, m)
-    return out
+    return out, _alternatives(told)
+
+
+def _alternatives(told: dict[tuple[int, int, int], tuple[float, float]]) -> Alternatives:
+    """Candidates by row, most probable first."""
+    if not told:
+        return Alternatives.none()
+    order = sorted(told.items(), key=lambda item: (item[0][0], -item[1][0]))
+    row, track, way = (np.array(column, np.int64) for column in zip(*(key for key, _ in order), strict=True))
+    mass, moment = (np.array(column, np.float64) for column in zip(*(value for _, value in order), strict=True))
+    return Alternatives(row, track, moment / mass, mass, way)
 
 
 def _winner(engine: Engine, final: IntArray, weight: FloatArray) -> int:
