@@ -262,6 +262,8 @@ HELD = 0.6
 APART = 25.0
 #: Sigmas past a toe at which a turnout's leg may be declared.
 GUARD = 3.0
+#: Probability of a frame far off beyond which no track is declared.
+FRAME_OFF = 0.01
 #: Posterior below which a hypothesis that may not have reached a toe does not keep the others from being declared past it.
 NEGLIGIBLE = 1e-3
 #: A jump of the position beyond this is no step of a GNSS error but a fault, m: the train coasts until fixes fit again ...
@@ -284,6 +286,8 @@ FORCE_STEP, SCALE_STEP = 0.3, 0.05
 DEAD_WHEEL = 0.2
 #: Inertial means repeat each other when they differ by less (rad/s, m/s^2): the means are differences of sums, with their rounding.
 REPEATED = 1e-9
+#: How much wider the law of a misled estimate's distance from the fixes is than that of a sound one's.
+FAULT_SPREAD = 10.0
 #: How often dead reckoning by the wheel begins anew, s.
 CHECK_INTERVAL = 60.0
 #: Way over which inertial rows count once as evidence of a track, m.

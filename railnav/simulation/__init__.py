@@ -2,7 +2,16 @@
 
 from railnav.simulation.bundled import demo_line
 from railnav.simulation.driving import Driving, Motion, drive
-from railnav.simulation.faults import FAULTS, Fault, with_fault, with_shifted_model, with_stale_track
+from railnav.simulation.faults import (
+    FAULTS,
+    MODEL_FAULTS,
+    Fault,
+    model_with_fault,
+    with_fault,
+    with_shifted_model,
+    with_stale_track,
+    without_track,
+)
 from railnav.simulation.journey import Leg, Path, Stop, path_of
 from railnav.simulation.sensors import (
     IMU_SHEETS,
@@ -24,6 +33,7 @@ from railnav.simulation.train import poses, simulate
 __all__ = [
     "FAULTS",
     "IMU_SHEETS",
+    "MODEL_FAULTS",
     "OUTFITS",
     "PHONE",
     "SERVICE",
@@ -43,6 +53,7 @@ __all__ = [
     "Stop",
     "demo_line",
     "drive",
+    "model_with_fault",
     "outfit_of",
     "path_of",
     "poses",
@@ -50,4 +61,5 @@ __all__ = [
     "with_fault",
     "with_shifted_model",
     "with_stale_track",
+    "without_track",
 ]

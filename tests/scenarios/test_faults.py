@@ -9,11 +9,20 @@ import pytest
 
 import railnav as rn
 from railnav.errors import InputError
-from railnav.simulation import FAULTS, SERVICE, BaliseSensor, Leg, with_fault, with_shifted_model, with_stale_track
+from railnav.simulation import (
+    FAULTS,
+    MODEL_FAULTS,
+    SERVICE,
+    BaliseSensor,
+    Leg,
+    model_with_fault,
+    with_fault,
+    with_shifted_model,
+)
 from railnav.simulation.faults import Fault
 
 #: Faults that the navigator does not master yet; `docs/accuracy.md` says so.
-NOT_YET = {"imu-late-0.2s"}
+NOT_YET = {"imu-late-0.2s", "model-9m-south", "track-missing"}
 
 ONSET = 130.0
 SEEDS = (3, 4)
@@ -53,19 +62,13 @@ def keeps_the_pact(solution, evaluation):
     assert evaluation.jumps.illegal == ()
 
 
-@pytest.mark.parametrize(
-    "fault",
-    [
-        pytest.param(
-            f,
-            marks=[pytest.mark.xfail(raises=AssertionError, strict=True, reason="not mastered yet")]
-            if f.name in NOT_YET
-            else [],
-        )
-        for f in FAULTS.values()
-    ],
-    ids=lambda f: f.name,
-)
+def as_they_stand(faults: dict[str, Fault]):
+    """Faults as parameters; those not mastered must fail."""
+    mark = pytest.mark.xfail(raises=AssertionError, strict=True, reason="not mastered yet")
+    return [pytest.param(f, marks=[mark] if f.name in NOT_YET else []) for f in faults.values()]
+
+
+@pytest.mark.parametrize("fault", as_they_stand(FAULTS), ids=lambda f: f.name)
 def test_the_navigator_keeps_its_pact_under_every_fault(line, rides, fault: Fault):
     for seed, (run, truth) in rides[fault.subject].items():
         solution, evaluation = judged(with_fault(run, fault.name, start=ONSET, seed=seed), truth, line)
@@ -86,16 +89,38 @@ def test_a_sound_run_is_tracked_closely(line, rides):
         assert np.mean(solution.mode[solution.time > ONSET] == rn.Mode.TRACKING) > 0.9
 
 
+FLAGS = {rn.Mode.COASTING, rn.Mode.AMBIGUOUS, rn.Mode.OFF_MODEL, rn.Mode.LOST}
+
+
+@pytest.mark.parametrize("fault", as_they_stand(MODEL_FAULTS), ids=lambda f: f.name)
+def test_a_model_out_of_date_never_makes_the_navigator_sure_of_a_wrong_track(line, rides, fault: Fault):
+    stale = model_with_fault(line, fault.name, "77R-03", start=3000.0)
+    for run, truth in rides["gnss"].values():
+        if fault.name == "track-missing":
+            solution = rn.navigate(run, stale)
+            assert np.mean(np.isin(solution.mode, list(FLAGS))) > 0.5
+            continue
+        solution, evaluation = judged(run, truth, stale)
+        keeps_the_pact(solution, evaluation)
+        if fault.expected == "flagged":
+            assert set(solution.mode[solution.time > 60.0]) & FLAGS
+
+
 @pytest.mark.parametrize("aside", [2.0, -2.0])
 def test_a_model_in_a_mistaken_frame(line, rides, aside):
     for run, truth in rides["gnss"].values():
         keeps_the_pact(*judged(run, truth, with_shifted_model(line, east=aside, north=0.0)))
 
 
-def test_a_track_moved_since_the_survey(line, rides):
-    stale = with_stale_track(line, "77R-03", start=3000.0, length=400.0, slew=1.5)
-    for run, truth in rides["gnss"].values():
-        keeps_the_pact(*judged(run, truth, stale))
+def test_a_balise_read_under_another_name_moves_nothing(line, rides):
+    for seed, (run, truth) in rides["balise"].items():
+        _, evaluation = judged(with_fault(run, "balise-misnamed", start=ONSET, seed=seed), truth, line)
+        assert np.abs(evaluation.along).max() < 10.0
+
+
+def test_unknown_faults_of_a_model_are_refused(line):
+    with pytest.raises(InputError, match="no fault 'gremlins' of a model"):
+        model_with_fault(line, "gremlins", "77R-03", start=0.0)
 
 
 def test_faults_leave_the_sound_run_alone_and_touch_one_stream(rides):

@@ -37,6 +37,7 @@ from railnav.navigation.columns import (
     C_SIGMA_EAST,
     C_SIGMA_NORTH,
     CHECK_INTERVAL,
+    FAULT_SPREAD,
     FRAME_EAST,
     FRAME_NORTH,
     GNSS_EAST,
@@ -46,6 +47,7 @@ from railnav.navigation.columns import (
     K_CORRELATED,
     K_FRAME_FAULT,
     K_FRAME_FAULT_SIGMA,
+    K_GNSS_FAULT,
     K_GNSS_TIME,
     K_MEMORY,
     K_ODOMETER_SLIP,
@@ -195,7 +197,8 @@ def residual_bound(fil, shared, bank, work, h):
     """Bound by solution separation from the fixes alone (22): how far they lie along from the estimate, and what they are worth.
 
     PL = |e| + K sigma, e the receiver's error along the track as the filter sees it: it is the estimate that is off by that, if a
-    wheel, an inertial sensor or the model's curvature has misled it. K as for dead reckoning; 0 where faults are not reckoned with.
+    wheel, an inertial sensor or the model's curvature has misled it. 2 Q(K) is the risk over the probability of such a fault, given e;
+    0 where faults are not reckoned with.
     """
     if fil.risk[2] <= 0.0:
         return 0.0
@@ -210,15 +213,24 @@ def residual_bound(fil, shared, bank, work, h):
     east, north = scale * common[C_SIGMA_EAST], scale * common[C_SIGMA_NORTH]
     error = (x[i_f] + east * x[i_g]) * te + (x[i_f + 1] + north * x[i_g + 1]) * tn
     variance = common[C_FRAME_SIGMA] ** 2 + (east * te) ** 2 + (north * tn) ** 2
-    bound = abs(error) + fil.risk[2] * math.sqrt(variance)
+    # the farther the fixes lie, the likelier something has misled the estimate: prior odds, and those of a wide law against this one
+    odds = k[K_GNSS_FAULT] * math.exp(min(0.5 * error * error / variance, 50.0)) / FAULT_SPREAD
+    quantile = max(fil.risk[2], tail_quantile(min(fil.risk[0] * (1.0 + 1.0 / odds), 1.0)))
+    bound = abs(error) + quantile * math.sqrt(variance)
     # a frame that is off across the track is off along as well, as far as nothing else has told the place
     info = bank.info[h]
-    framed = info[FRAMED] + info[FRAMED_ODDS]
-    framed = math.exp(framed - log_sum(log_sum(info[FADING], info[ASTRAY]), framed))
+    framed = frame_off(info)
     if framed <= fil.risk[0]:
         return bound
     share = min(variance_of(bank.P_sqrt[h], fil.at[POSITION]) / variance, 1.0)
     return max(bound, tail_quantile(fil.risk[0] / framed) * abs(info[FRAMED_CROSS]) * share)
+
+
+@part
+def frame_off(info):
+    """Probability, if the train is on a hypothesis' track, that the run's frame is off by far more than is known of it."""
+    framed = info[FRAMED] + info[FRAMED_ODDS]
+    return math.exp(framed - log_sum(log_sum(info[FADING], info[ASTRAY]), framed))
 
 
 @part
