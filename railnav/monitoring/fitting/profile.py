@@ -21,7 +21,9 @@ FLOOR = 5e-4
 #: A sum of squares may grow by this for each piece that is left out.
 _DEARER = 9.0
 #: Pieces left out, at most.
-_MOST_DROPPED = 40
+_MOST_DROPPED = 20
+#: Steps after which a piece left out is judged.
+_FEW = 4
 #: What vertical curves may be.
 VERTICAL = ("parabola", "circle")
 
@@ -169,7 +171,7 @@ def settled(
         if doubt[j] >= 1.0 or len(s.begin) < 2:
             return fitted, each
         try:
-            again = stretches.fit_stretches(_without(s, j), along, values, per_point)
+            again = stretches.fit_stretches(_without(s, j), along, values, per_point, steps=_FEW)
         except EstimationError:
             refused.add(round(float(s.begin[j]), 3))
             continue
