@@ -112,6 +112,12 @@ PAGES = {
                 "python benchmarks/monte_carlo.py --scale 0.6",
             ),
             Section(
+                "protection-level",
+                "How often the protection level fails",
+                "Simulated: GNSS 1.5 m and odometer, six ways through the bundled line, fresh noise for every run.",
+                "python benchmarks/protection_level.py --full",
+            ),
+            Section(
                 "faults",
                 "Named faults",
                 "What goes wrong with sensors, simulated, and what the navigator makes of it. `railnav simulate "
