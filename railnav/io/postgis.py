@@ -432,7 +432,7 @@ def _packed_records(model: TrackModel, where: StoreAddress) -> bytes | None:
         path = Path(folder) / "records.gpkg"
         with create(path, model.frame.crs_wkt) as container:
             _write_meta(container, model)
-            _write_records(container, model, records)
+            _write_records(container, records)
         if path.stat().st_size > MAX_RECORD_BYTES:
             raise ModelError(
                 f"survey records of {path.stat().st_size / 1e6:.0f} MB do not fit a field of the database",

@@ -34,8 +34,8 @@ def do_speed(fil, shared, bank, work, h, row):
 
 
 @njit
-def do_course(fil, shared, bank, work, h, row):
-    equations.course_row(fil, shared, bank, work, h, row, 1.0, 0.1)
+def do_course(fil, shared, bank, work, h, row, sign):
+    equations.course_row(fil, shared, bank, work, h, row, sign, 0.1)
 
 
 @njit
@@ -204,13 +204,15 @@ def test_row_of_the_speed_of_the_receiver(engine):
     assert cosine == pytest.approx(1.0, abs=1e-6)
 
 
+@pytest.mark.parametrize("way", [1.0, -1.0], ids=["onward", "backing up"])
 @pytest.mark.parametrize(("lever", "near"), [(0.0, 1e-6), (2.0, 1e-5)], ids=["axis", "antenna ahead"])
-def test_row_of_the_course(engine, lever, near):
+def test_row_of_the_course(engine, lever, near, way):
     """Velocity across the path: the row against differences of the whole geometry, at the place that the time stamp says.
 
-    The change of the curvature over a lever arm ahead is left out.
+    The change of the curvature over a lever arm ahead is left out. A train that backs up sees the same curves under its course.
     """
     h, at = engine.living()[0], engine.filter.at
+    engine.bank.x[h, at[State.SPEED]] = 22.0 * way
     engine.filter.lever[:] = lever, 0.4, -3.8
     engine.bank.x[h, at[State.TIME_TAG]] = 0.0
     place(engine)
@@ -218,7 +220,7 @@ def test_row_of_the_course(engine, lever, near):
     point = engine.work.point[h]
     bearing = math.atan2(point[paths.P_D_EAST], point[paths.P_D_NORTH]) + 2e-4
     row[[c.TIME, c.SIGMA_SPEED, c.GNSS_SPEED, c.FORCE]] = 0.0, 0.1, 22.0, 0.4
-    row[[c.COURSE_EAST, c.COURSE_NORTH]] = math.sin(bearing), math.cos(bearing)
+    row[[c.COURSE_EAST, c.COURSE_NORTH]] = way * math.sin(bearing), way * math.cos(bearing)
 
     def predicted():
         x = engine.bank.x[h]
@@ -232,7 +234,7 @@ def test_row_of_the_course(engine, lever, near):
 
     def update():
         engine.work.vector[c.W_H] = 0.0
-        do_course(engine.filter, engine.shared, engine.bank, engine.work, h, row)
+        do_course(engine.filter, engine.shared, engine.bank, engine.work, h, row, way)
 
     applied = row_of(engine, update)
     numeric = differences(engine, predicted, step=1e-3)
