@@ -627,7 +627,9 @@ def course_row(fil, shared, bank, work, h, row, sign, sigma):
     te = point[P_D_EAST] + step * bend * point[P_D_NORTH]
     tn = point[P_D_NORTH] - step * bend * point[P_D_EAST]
     across = sign * speed * (course_east * tn - course_north * te) / math.hypot(te, tn)
-    across -= speed * bend * fil.lever[0]  # whichever way the train runs: the antenna's circle is turned against the track by as much
+    across -= (
+        speed * bend * fil.lever[0]
+    )  # whichever way the train runs: the antenna's circle is turned against the track by as much
     floor = speed * k[K_COURSE_SIGMA] * (0.2 if stated else 3.0)
     bent = 0.5 * speed * BEND_CHANGE * variance_of(P_sqrt, i_s)
     h_row[i_s] = speed * bend
