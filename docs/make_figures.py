@@ -115,7 +115,7 @@ PAGES = {
                 "protection-level",
                 "How often the protection level fails",
                 "Simulated: GNSS 1.5 m and odometer, six ways through the bundled line, fresh noise for every run.",
-                "python benchmarks/protection_level.py --full",
+                "python benchmarks/protection_level.py --epochs 60000",
             ),
             Section(
                 "faults",

@@ -28,6 +28,9 @@ AVERAGED, BENT, INCLINED = (35.0, 0.35), (7e-5, 0.45), (1.8e-3, 0.8)
 TURNED, SLOPE, INCLINED_LENGTH = 8e-3, 1.2e-6, 200.0
 #: What is left of the curvature (1/m) and of the places where it changes (m) in a model that is exact: a vehicle's bogies are metres apart.
 LEAST_BENT, LEAST_SHIFT = 2e-6, 0.2
+#: A model that is not built from runs is exact in shape if it states no more than this across, m; else it is a map, drawn or refined, whose
+#: shape is taken for what the settings say.
+EXACT = 0.05
 #: Speed at which an error of the gradient is counted as noise of the acceleration, m/s.
 USUAL_SPEED = 20.0
 #: Least error across that a built model is credited with, m.
@@ -86,8 +89,8 @@ def shape_of(model: TrackModel, network: Network, *, gravity: float = 9.80665) -
     Returns
     -------
     Shape
-        Built: the laws above. Stated, not built: exact in shape but for the vehicle, and for what the sigma across makes over 200 m,
-        which the filter counts anyway. Nothing stated: NaN.
+        Built: the laws above. Not built, stated to be within `EXACT`: exact in shape but for the vehicle, and for what the sigma across
+        makes over 200 m, which the filter counts anyway. Nothing stated, or more: NaN.
 
     Notes
     -----
@@ -109,10 +112,11 @@ def shape_of(model: TrackModel, network: Network, *, gravity: float = 9.80665) -
     along = _along(model)
     sigma = network.sigma_cross
     if not isinstance(model.provenance.get("build"), dict) or not sigma.any():
-        shift = max(float(np.median(along[stated])), LEAST_SHIFT) if stated.any() else math.nan
+        exact = stated & (sigma <= EXACT)
+        shift = max(float(np.median(along[exact])), LEAST_SHIFT) if exact.any() else math.nan
         return Shape(
             curvature,
-            np.where(stated, LEAST_BENT, np.nan),
+            np.where(exact, LEAST_BENT, np.nan),
             0.0,
             math.nan,
             shift,

@@ -258,7 +258,7 @@ class Settings:
     frame_fault: float = 6e-3
     frame_fault_sigma: float = 10.0
     astray_rate: float = 1e-3
-    astray_walk: float = 0.6
+    astray_walk: float = 1.2
     astray_time: float = 20.0
     balise_missed: float = 1e-3
     curvature_sigma: float = 2e-5
