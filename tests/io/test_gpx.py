@@ -142,7 +142,7 @@ def test_a_run_folder_reads(tmp_path):
 DATA = f"{HEAD}<trk><trkseg>\n{FULL}{point('2021-06-29T10:35:19Z')}</trkseg></trk></gpx>".encode()
 
 
-@settings(max_examples=300, deadline=20_000, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=300, deadline=1000, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     edits=st.lists(st.tuples(st.integers(0, len(DATA) - 1), st.binary(max_size=3), st.integers(0, 9)), max_size=4),
     cut=st.integers(0, len(DATA)),
@@ -159,7 +159,7 @@ def test_a_mutated_file_is_read_or_refused(tmp_path, edits, cut):
     assert (np.diff(read.table.number["time_s"]) > 0).all()
 
 
-@settings(max_examples=300, deadline=20_000, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=300, deadline=1000, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(texts=st.lists(st.text("0123456789.-+eEnaTZ:, <>&;\u0663", max_size=30), min_size=6, max_size=6))
 def test_any_text_in_an_element_is_read_or_refused(tmp_path, texts):
     names = ("time", "ele", "geoidheight", "sat", "hdop", "speed")

@@ -313,7 +313,7 @@ def test_a_run_folder_reads(tmp_path):
 DATA = "".join(some(12)).encode()
 
 
-@settings(max_examples=250, deadline=20_000, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=250, deadline=1000, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     edits=st.lists(st.tuples(st.integers(0, len(DATA) - 1), st.binary(max_size=6), st.integers(0, 40)), max_size=8),
     cut=st.integers(0, len(DATA)),
@@ -334,7 +334,7 @@ def test_a_mutated_log_is_read_or_refused(tmp_path, edits, cut):
     assert (np.abs(n["latitude_deg"]) <= 90).all()
 
 
-@settings(max_examples=250, deadline=20_000, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=250, deadline=1000, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(texts=st.lists(st.text("GNRMCAVTSLZD0159.,-*$", max_size=60), max_size=6))
 def test_any_sentence_with_a_lawful_checksum_is_read_or_counted(tmp_path, texts):
     kinds = ["GNGGA", "GNRMC", "GNGST", "GNVTG", "GNGLL", "GNZDA", "GNGNS"]

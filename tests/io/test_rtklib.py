@@ -214,7 +214,7 @@ def test_the_real_drive_reads_with_its_inertial_unit(shared_data):
 DATA = (HEAD + "".join(rows(12))).encode()
 
 
-@settings(max_examples=250, deadline=20_000, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=250, deadline=1000, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     edits=st.lists(st.tuples(st.integers(0, len(DATA) - 1), st.binary(max_size=6), st.integers(0, 40)), max_size=8),
     cut=st.integers(0, len(DATA)),

@@ -293,7 +293,7 @@ HUNDRED = [pvt(i) for i in range(100)]
 DATA = b"".join(part for i in range(6) for part in (pvt(i), cov(i), hp(i), dop(i)))
 
 
-@settings(max_examples=250, deadline=20_000, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=250, deadline=1000, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     edits=st.lists(st.tuples(st.integers(0, len(DATA) - 1), st.binary(max_size=6), st.integers(0, 40)), max_size=8),
     cut=st.integers(0, len(DATA)),
@@ -313,7 +313,7 @@ def test_a_mutated_log_is_read_or_refused(tmp_path, edits, cut):
     assert (np.abs(n["latitude_deg"]) <= 90).all()
 
 
-@settings(max_examples=200, deadline=20_000, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=200, deadline=1000, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.lists(
         st.tuples(st.sampled_from(["NAV-PVT", "NAV-COV", "NAV-HPPOSLLH", "NAV-DOP"]), st.binary(max_size=92)),
