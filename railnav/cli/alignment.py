@@ -76,7 +76,7 @@ def command(
         raise InputError("is no model", file=model, remedy="name a model, .gpkg or .geojson")
     from railnav.io.designs import write_designs
     from railnav.monitoring.fitting import axis_of_model, fit_design
-    from railnav.web.alignment import alignment_page, save_sheets, sheets
+    from railnav.web.bands import drawn_design
 
     source = _files.read_model(model)
     try:
@@ -110,16 +110,21 @@ def command(
     designs = [one.design for one in fitted]
     written = write_designs(designs, output)
     if report is not None:
+        drawn = [drawn_design(one.design, one) for one in fitted]
         if report.suffix.lower() == ".html":
+            from railnav.web.alignment import alignment_page
             from railnav.web.report import is_simulated
 
             badge = "Simulated data" if is_simulated(source) else ""
-            page = alignment_page(designs, fitted, title=f"Alignment of {model.stem}", badge=badge, subtitle=model.name)
+            page = alignment_page(
+                drawn, title=f"Alignment of {model.stem}", badge=badge, subtitle=model.name, warnings=left_out
+            )
             _files.write_text(report, page)
         else:
-            long = report.suffix.lower() == ".pdf"
-            pictures = [picture for design in designs for picture in sheets(design, length=5000.0 if long else None)]
-            save_sheets(pictures, report)
+            from railnav.web.sheets import SHEET, save_sheets, sheets
+
+            length = SHEET if report.suffix.lower() == ".pdf" else None
+            save_sheets((picture for one in drawn for picture in sheets(one, length=length)), report)
     warnings = [line for one in fitted for line in one.warnings] + left_out
     if as_json:
         print_json(
@@ -156,7 +161,7 @@ def described(one: Fitted) -> dict[str, Any]:
     import numpy as np
 
     from railnav.track.elements import KIND_NAMES
-    from railnav.web.alignment import gradient_bars
+    from railnav.web.bands import gradient_bars
 
     plan, design = one.design.plan, one.design
     with np.errstate(divide="ignore"):

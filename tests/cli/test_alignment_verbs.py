@@ -57,6 +57,41 @@ def test_designs_are_drawn(tmp_path: Path) -> None:
         assert "written" in out
 
 
+def test_a_model_is_drawn_as_it_is_without_fitting(stock: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import railnav.monitoring.fitting as fitting
+
+    def refused(*_: object, **__: object) -> None:
+        raise AssertionError("fitted although nobody asked")
+
+    monkeypatch.setattr(fitting, "fit_design", refused)
+    code, out, err = run("draw", stock / "line.gpkg", "-o", stock / "own.html", "--no-elements", "--json")
+    assert code == 0, err
+    model = TrackModel.read(stock / "line.gpkg")
+    assert [t["track"] for t in json.loads(out)["tracks"]] == list(model.track_id)
+    assert all(t["elements"] == 0 for t in json.loads(out)["tracks"])
+    page = (stock / "own.html").read_text(encoding="utf-8")
+    assert "elements were not fitted" in page
+    # asked for nothing, a model longer than the limit is drawn as it is
+    monkeypatch.setattr("railnav.cli.draw.FITTED_UNASKED", 100.0)
+    code, out, _ = run("draw", stock / "line.gpkg", "-o", stock / "own.svg", "--track", "77R-02")
+    assert code == 0
+    assert "--elements fits its elements first" in out
+    assert (stock / "own.svg").stat().st_size > 2000
+
+
+def test_a_drawn_track_is_the_models_own_geometry(stock: Path) -> None:
+    from railnav.web.bands import drawn_track
+
+    model = TrackModel.read(stock / "line.gpkg")
+    one = drawn_track(model, "77R-02")
+    own = model.knots("77R-02")
+    along = np.append(0.0, np.cumsum(np.hypot(np.diff(model.easting[own]), np.diff(model.northing[own]))))
+    here = one.inside(one.start + along)
+    assert np.hypot(here.easting - model.easting[own], here.northing - model.northing[own]).max() < 1e-6
+    assert here.curvature * np.mean(model.scale[own]) == pytest.approx(model.curvature[own], abs=1e-12)
+    assert here.gradient == pytest.approx(model.gradient[own], abs=1e-12)
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
