@@ -96,8 +96,16 @@ def _cross_sigma(model: TrackModel) -> Any:
     return np.sqrt(np.maximum(variance, 0.0))
 
 
-#: More tracks than these are counted; JSON lists all.
+#: More tracks, or more names of lines, than these are counted; JSON lists all.
 MOST_TRACKS = 60
+MOST_LINES = 12
+
+
+def _line_words(lines: list[str]) -> str:
+    """Return the names of lines in order, and how many more there are."""
+    names = [line or "(without a name)" for line in sorted(lines)]
+    more = len(names) - MOST_LINES
+    return ", ".join(names[:MOST_LINES]) + (f" and {more} more" if more > 0 else "")
 
 
 def print_model(facts: dict[str, Any], title: str) -> None:
@@ -111,7 +119,7 @@ def print_model(facts: dict[str, Any], title: str) -> None:
             "nodes": ", ".join(words.count(n, *_NODES.get(kind, (kind, ""))) for kind, n in kinds.items()),
             "movements": f"{facts['movements']} permitted",
             "mileposts": facts["mileposts"] or "",
-            "line references": ", ".join(line or "(without a name)" for line in facts["lines"]),
+            "line references": _line_words(facts["lines"]),
             "plane": facts["crs"],
             "transformation": f"{facts['operation']} ({words.accuracy(facts['operation_accuracy_m'])})",
             "made by": _maker(provenance),
