@@ -39,28 +39,29 @@ TABLE_ENDINGS = (".csv", ".parquet")
 @click.option(
     "--cutoff",
     type=click.FloatRange(20, 500),
-    default=100.0,
-    show_default=True,
-    help="Wavelength that a smoothed target halves, m.",
+    help="Wavelength that a smoothed target halves, m.  [default: 100; 500 where the axis is known worse than 20 mm]",
 )
 @click.option(
     "--fixed", type=PATH, help="Fixed points: .csv with track, offset_m, slew_mm, slew_tolerance_mm, lift_mm, ..."
 )
 @click.option(
-    "--most-slew", type=click.FloatRange(0, 1000), default=100.0, show_default=True, help="Greatest slew, mm."
+    "--most-slew",
+    type=click.FloatRange(0, 1000),
+    help="Greatest slew, mm.  [default: 100; 1000 where the axis is known worse than 20 mm]",
 )
 @click.option(
     "--least-lift", type=click.FloatRange(-1000, 1000), default=0.0, show_default=True, help="Least lift, mm."
 )
 @click.option(
-    "--most-lift", type=click.FloatRange(0, 1000), default=100.0, show_default=True, help="Greatest lift, mm."
+    "--most-lift",
+    type=click.FloatRange(0, 1000),
+    help="Greatest lift, mm.  [default: 100; 1000 where the axis is known worse than 20 mm]",
 )
 @click.option(
     "--curvature-rate",
     type=click.FloatRange(0, 1e-2, min_open=True),
-    default=5e-6,
-    show_default=True,
-    help="Greatest change of curvature that what is left may add, in plan and profile, 1/m^2.",
+    help="Greatest change of curvature that what is left may add, in plan and profile, 1/m^2.  [default: 5e-6; 1e-4 where the axis is "
+    "known worse than 20 mm]",
 )
 @click.option(
     "--ramp",
@@ -81,12 +82,12 @@ def command(
     between: str | None,
     km: str | None,
     step: float,
-    cutoff: float,
+    cutoff: float | None,
     fixed: Path | None,
-    most_slew: float,
+    most_slew: float | None,
     least_lift: float,
-    most_lift: float,
-    curvature_rate: float,
+    most_lift: float | None,
+    curvature_rate: float | None,
     ramp: float | None,
     as_json: bool,
 ) -> None:
@@ -101,6 +102,8 @@ def command(
     Example:
       railnav lining demo/survey-1 demo/survey-2 -m demo/line.gpkg -o plan.csv --report plan.html
     """  # noqa: D301
+    from dataclasses import replace
+
     from railnav.cli import _files
     from railnav.cli._terminal import print_json, print_warnings, progress
     from railnav.errors import InputError
@@ -116,7 +119,7 @@ def command(
         _files.need_report()
     if axis is not None:
         _files.check_output(axis, _files.EXPORT_ENDINGS, inputs=[*inputs, output, *([report] if report else [])])
-    if least_lift > most_lift:
+    if most_lift is not None and least_lift > most_lift:
         raise click.UsageError(f"--least-lift {least_lift:g} is above --most-lift {most_lift:g}")
     if between is not None and km is not None:
         raise click.UsageError("--between and --km both name the stretch: give one")
@@ -125,7 +128,7 @@ def command(
         raise click.UsageError("--alignment and --design-crs go with --design")
     from railnav.io.lining import read_fixed_points, write_plan
     from railnav.io.run import read_run
-    from railnav.monitoring.lining import LiningLimits, line_up
+    from railnav.monitoring.lining import line_up, usual_limits
     from railnav.monitoring.position import stretch_of
     from railnav.monitoring.survey_section import measured_section
 
@@ -138,20 +141,26 @@ def command(
         if not designs:
             raise InputError("holds no alignment", file=design)
     names = [name.strip() for name in tracks.split(",") if name.strip()] if tracks is not None else []
-    limits = LiningLimits(
-        most_slew / 1e3,
-        least_lift / 1e3,
-        most_lift / 1e3,
-        curvature_rate,
-        curvature_rate,
-        None if ramp is None else ramp / 1e3,
-    )
+    asked = {
+        "most_slew": None if most_slew is None else most_slew / 1e3,
+        "least_lift": least_lift / 1e3,
+        "most_lift": None if most_lift is None else most_lift / 1e3,
+        "curvature_rate": curvature_rate,
+        "gradient_rate": curvature_rate,
+        "ramp": None if ramp is None else ramp / 1e3,
+    }
     with progress() as tell:
         recorded = [read_run(run) for run in runs]
         measured, surveyed = measured_section(recorded, reference, tracks=names, progress=tell)
         if stretch is not None:
             scale = 1.0 if km is None else 1e3
             measured = stretch_of(measured, scale * stretch[0], scale * stretch[1], by_chainage=km is not None)
+        usual, _ = usual_limits(measured)
+        limits = replace(usual, **{name: value for name, value in asked.items() if value is not None})
+        if limits.least_lift > limits.most_lift:
+            raise click.UsageError(
+                f"--least-lift {least_lift:g} is above the greatest lift of {1e3 * limits.most_lift:g} mm"
+            )
         slews, lifts = read_fixed_points(fixed, measured.section) if fixed is not None else ((), ())
         if tell:
             tell("line", 0, 1)
@@ -172,7 +181,7 @@ def command(
     if report is not None:
         from railnav.web.lining import lining_page
 
-        page = lining_page(plan, simulated=any(run.gnss and run.gnss.receiver == "simulated" for run in recorded))
+        page = lining_page(plan, simulated=any(run.simulated for run in recorded))
     write_plan(plan, output)
     if axis is not None:
         from railnav.monitoring.lined import lined_model
@@ -239,6 +248,7 @@ def facts(plan: LiningPlan) -> dict[str, Any]:
 def _print(plan: LiningPlan) -> None:
     from railnav.cli._terminal import print_facts, print_table
     from railnav.web import words
+    from railnav.web.lining import good_to
 
     print_facts(
         f"Lining of {plan.section.name}",
@@ -248,7 +258,7 @@ def _print(plan: LiningPlan) -> None:
             else f"smoothed, waves under {plan.cutoff:.0f} m taken out",
             "length": words.length(float(plan.distance[-1] - plan.distance[0]), 5),
             "measured by": ", ".join(plan.measured.runs) or "the model's own axis",
-            "good to": f"{words.length(plan.measured.sigma_right, 2)} across, {words.length(plan.measured.sigma_up, 2)} in height",
+            "good to": good_to(plan),
             "greatest slew": words.length(float(abs(plan.slew).max()), 3),
             "greatest lift": words.length(float(plan.lift.max()), 3),
         },

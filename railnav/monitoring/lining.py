@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from railnav.errors import TrackError
 from railnav.monitoring.design import Design
-from railnav.monitoring.filters import D1, D2, D3_ALIGNMENT, D3_LEVEL, Band, band_pass, low_pass, stretches
+from railnav.monitoring.filters import D1, D2, D3_ALIGNMENT, D3_LEVEL, band_pass, low_pass, stretches
 from railnav.monitoring.limits import FINE_ENOUGH
 from railnav.monitoring.position import MeasuredAxis, band_sigma, shape_sigma
 from railnav.monitoring.section import Section
 from railnav.monitoring.smoothing import Bounds, FixedPoint, InfeasibleError, corrections, whittaker
 from railnav.monitoring.target import SHORTEST, level_above, target_along
-from railnav.monitoring.versines import Chord, closed_versines, hallade, versines_in_plan
+from railnav.monitoring.versines import Chord, slews_by_versines, versines_in_plan
 
 FloatArray = NDArray[np.float64]
 
@@ -58,6 +58,52 @@ class LiningLimits:
     ramp: float | None = None
 
 
+#: Limits and cut-off, m, that show the method on an axis known worse than `USABLE`: a machine's cannot smooth its errors.
+WIDE, WIDE_CUTOFF = LiningLimits(1.0, 0.0, 1.0, 1e-4, 1e-4), 500.0
+#: Cut-off of a smoothed target otherwise, m.
+CUTOFF = 100.0
+
+
+def usual_limits(measured: MeasuredAxis) -> tuple[LiningLimits, float]:
+    """Limits and cut-off (m) that suit an axis: a machine's, or wide ones where it is known worse than `USABLE`.
+
+    Examples
+    --------
+    >>> callable(usual_limits)
+    True
+    """
+    coarse = math.isfinite(measured.sigma_right) and measured.sigma_right > USABLE
+    return (WIDE, WIDE_CUTOFF) if coarse else (LiningLimits(), CUTOFF)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lined:
+    """The axis as measured and as planned, each step of the measured axis rather than each node.
+
+    Attributes
+    ----------
+    distance : (n,) array
+        m along the section.
+    slew, lift : (n,) array
+        As the machine interpolates them, m; lift NaN without heights.
+    right, up : (n,) array
+        Before: beside the target or base line, and above its profile, m.
+    versine_before, versine_after : (n,) array
+        On a chord of 20 m, m; NaN near the ends.
+    channels : mapping of (str, str) to (array, array)
+        Before and after by channel ("alignment", "longitudinal_level") and band, m; NaN near the ends.
+    """
+
+    distance: FloatArray
+    slew: FloatArray
+    lift: FloatArray
+    right: FloatArray
+    up: FloatArray
+    versine_before: FloatArray
+    versine_after: FloatArray
+    channels: Mapping[tuple[str, str], tuple[FloatArray, FloatArray]]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class LiningPlan:
     """Slews and lifts along a section.
@@ -92,6 +138,8 @@ class LiningPlan:
         By channel and band: sigma that the axis has there by the noise of its sensors, m (NaN where that is not known), and whether it
         bears corrections in that band: the sigma is at most a third of what was found there.
     measured : MeasuredAxis
+    fine : Lined
+        The same between the nodes, with the channels before and after.
     design : str
         The design's track; empty for a smoothed target.
     cutoff : float
@@ -123,6 +171,7 @@ class LiningPlan:
     spread: Mapping[tuple[str, str], tuple[float, float]]
     bears: Mapping[tuple[str, str], tuple[float, bool]]
     measured: MeasuredAxis
+    fine: Lined
     design: str
     cutoff: float
     limits: LiningLimits
@@ -142,7 +191,7 @@ def line_up(
     designs: Sequence[Design] = (),
     alignment: str = "",
     step: float = 5.0,
-    cutoff: float = 100.0,
+    cutoff: float | None = None,
     limits: LiningLimits | None = None,
     fixed_slew: Sequence[FixedPoint] = (),
     fixed_lift: Sequence[FixedPoint] = (),
@@ -162,9 +211,11 @@ def line_up(
         Name of the design meant, where several lie along the section.
     step : float
         Between nodes, m: 1 or 5, or another multiple of the measured axis's step.
-    cutoff : float
+    cutoff : float, optional
         Wavelength that the smoothed target halves, m.
     limits : LiningLimits, optional
+        Both by default as `usual_limits` has them: 100 m and a machine's limits, wider ones where the axis is known too coarsely for any
+        machine.
     fixed_slew, fixed_lift : sequence of FixedPoint
     smooth_base : bool
         Without a design: measure deviations from the model's axis smoothed to the cut-off, not from the axis itself: right where the model
@@ -186,7 +237,8 @@ def line_up(
     -----
     10 km at 1 m take about a second.
     """
-    limits = limits or LiningLimits()
+    usual, wave = usual_limits(measured)
+    limits, cutoff = limits or usual, wave if cutoff is None else cutoff
     every = step / measured.step
     if abs(every - round(every)) > 1e-9 or every < 1.0:
         raise TrackError(f"nodes each {step} m do not fit an axis measured each {measured.step} m")
@@ -253,18 +305,20 @@ def line_up(
     else:
         notes.append("no heights along the whole stretch: no lifts")
     fine_slew, fine_lift = _between(s, slew, d), _between(s, lift, d)
-    spread = _spread(deviation, fine_slew, level, fine_lift, measured.step)
+    channels = _channels(deviation, fine_slew, level, fine_lift, measured.step)
+    spread = _spread(channels)
     lined_east, lined_north = east + fine_slew * scale * cos, north - fine_slew * scale * sin
     chord = Chord.symmetric(CHORD)
     before, after = (
         versines_in_plan(e, n, measured.step, chord) for e, n in ((east, north), (lined_east, lined_north))
     )
-    classic = _classic(before, deviation, d, measured.step, cutoff, bool(name))
+    every = round(0.5 * CHORD / measured.step)
+    strung = slews_by_versines(deviation[::every], math.nan if name else cutoff / (0.5 * CHORD))
     strings = {}
-    if len(classic[0]):
-        inside = (d >= classic[0][0]) & (d <= classic[0][-1])
-        along = _between(classic[0], classic[1], d[inside])
-        strings = _spread(deviation[inside], along, np.empty(0), np.empty(0), measured.step)
+    if len(strung):
+        inside = d <= d[::every][-1]
+        along = _between(d[::every], strung, d[inside])
+        strings = _spread(_channels(deviation[inside], along, np.empty(0), np.empty(0), measured.step))
     shape = [
         shape_sigma(noise, cutoff) if noise else relative
         for noise, relative in (
@@ -275,7 +329,12 @@ def line_up(
     bears = _bears(measured, spread)
     notes += _said(bears)
     if not (measured.sigma_right <= USABLE):
-        notes.append("not for a machine: the axis is not known well enough for slews of millimetres")
+        wide = (
+            f"; slews of up to {limits.most_slew:g} m and a curvature rate of {limits.curvature_rate:.0e} 1/m^2 only show the method"
+            if limits.most_slew >= WIDE.most_slew
+            else ""
+        )
+        notes.append(f"not for a machine: the axis is not known well enough for slews of millimetres{wide}")
     return LiningPlan(
         section=section,
         distance=s,
@@ -291,14 +350,15 @@ def line_up(
         up_after=z + lift,
         versine_before=before[nodes],
         versine_after=after[nodes],
-        hallade_distance=classic[0],
-        hallade_slew=classic[1],
+        hallade_distance=d[::every][: len(strung)],
+        hallade_slew=strung,
         hallade_spread=strings,
         sigma_slew=_sigma(measured.sigma_right, shape[0], measured.local_right, rows, bool(name))[nodes],
         sigma_lift=_sigma(measured.sigma_up, shape[1], measured.local_up, rows, not free_level)[nodes],
         spread=spread,
         bears=bears,
         measured=measured,
+        fine=Lined(d, fine_slew, fine_lift, deviation, level, before, after, channels),
         design=name,
         cutoff=math.nan if name else cutoff,
         limits=limits,
@@ -373,9 +433,14 @@ def _corrected(
         if measured.sigma_right <= USABLE:
             raise
         known = f"to {measured.sigma_right:.2f} m" if math.isfinite(measured.sigma_right) else "with no stated accuracy"
+        wide = bounds.most >= WIDE.most_slew and bounds.third_difference >= WIDE.curvature_rate
+        instead = (
+            "line a stretch that was surveyed better"
+            if wide
+            else "slews of a metre, a curvature rate of 1e-4 1/m^2 and a cut-off of 500 m show the method on such data"
+        )
         raise InfeasibleError(
-            f"{error}; note that the axis is only known {known}, too coarse for lining; slews of a metre, a curvature rate "
-            "of 1e-4 1/m^2 and a cut-off of 500 m show the method on such data"
+            f"{error}; note that the axis is only known {known}, too coarse for lining; {instead}"
         ) from error
 
 
@@ -423,21 +488,28 @@ def _between(nodes: FloatArray, values: FloatArray, distance: FloatArray) -> Flo
     return np.asarray(PchipInterpolator(nodes, values)(np.clip(distance, nodes[0], nodes[-1])))
 
 
-def _spread(
+def _channels(
     right: FloatArray, slew: FloatArray, up: FloatArray, lift: FloatArray, step: float
-) -> dict[tuple[str, str], tuple[float, float]]:
-    """Standard deviations in the bands, before and after."""
-    found: dict[tuple[str, str], tuple[float, float]] = {}
+) -> dict[tuple[str, str], tuple[FloatArray, FloatArray]]:
+    """Alignment and longitudinal level in the bands, before and after."""
+    found: dict[tuple[str, str], tuple[FloatArray, FloatArray]] = {}
     for name, values, change, bands in (
         ("alignment", right, slew, (D1, D2, D3_ALIGNMENT)),
         ("longitudinal_level", up, lift, (D1, D2, D3_LEVEL)),
     ):
-        if not (np.isfinite(values).all() and np.isfinite(change).all()):
+        if not (len(values) and np.isfinite(values).all() and np.isfinite(change).all()):
             continue
         for band in bands:
             if step <= band.lower / 3.0 and len(values) * step > 4.0 * band.upper:
-                found[name, band.name] = (_sd(values, step, band), _sd(values + change, step, band))
+                found[name, band.name] = band_pass(values, step, band), band_pass(values + change, step, band)
     return found
+
+
+def _spread(
+    channels: Mapping[tuple[str, str], tuple[FloatArray, FloatArray]],
+) -> dict[tuple[str, str], tuple[float, float]]:
+    """Standard deviations of channels, before and after."""
+    return {key: (float(np.nanstd(before)), float(np.nanstd(after))) for key, (before, after) in channels.items()}
 
 
 def _bears(
@@ -464,29 +536,3 @@ def _said(bears: Mapping[tuple[str, str], tuple[float, bool]]) -> list[str]:
     allowed = ", ".join(words[key] for key, (_, good) in bears.items() if good) or "none of the bands up to 200 m"
     wanting = ", ".join(words[key] for key, (_, good) in bears.items() if not good)
     return [f"the accuracy of the axis allows corrections in {allowed}; in {wanting} they follow noise"]
-
-
-def _sd(values: FloatArray, step: float, band: Band) -> float:
-    out = band_pass(values, step, band)
-    return float(np.nanstd(out))
-
-
-def _classic(
-    versine: FloatArray, deviation: FloatArray, distance: FloatArray, step: float, cutoff: float, designed: bool
-) -> tuple[FloatArray, FloatArray]:
-    """Slews by the versine method on half chords of 10 m, from the versines as measured to smoothed or designed ones."""
-    every = round(0.5 * CHORD / step)
-    rows = np.arange(0, len(versine), every)
-    rows = rows[np.isfinite(versine[rows])]
-    if len(rows) < 8:
-        return np.empty(0), np.empty(0)
-    v_e = versine[rows]
-    if designed:  # the design's versines: those measured, less what the deviation adds to them
-        y = deviation[rows]
-        own = np.zeros(len(rows))
-        own[1:-1] = 0.5 * (y[:-2] + y[2:]) - y[1:-1]
-        v_d = v_e - own
-    else:
-        v_d = whittaker(v_e, 0.5 * CHORD, cutoff)
-    closed = closed_versines(v_e, v_d)
-    return distance[rows], hallade(v_e, closed).slew

@@ -308,7 +308,7 @@ def _why(
         else:
             where = "over the whole section"
         return (
-            f"no correction between {1e3 * bounds.least:+.3g} and {1e3 * bounds.most:+.3g} mm leaves a curvature rate of at most "
+            f"no correction between {1e3 * bounds.least:+.4g} and {1e3 * bounds.most:+.4g} mm leaves a curvature rate of at most "
             f"{bounds.third_difference:.1e} 1/m^2 {where}, even without fixed points; allow more of either"
         )
     kept = list(range(len(inside)))

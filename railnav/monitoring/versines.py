@@ -332,3 +332,38 @@ def closed_versines(measured: ArrayLike, designed: ArrayLike) -> FloatArray:
     v_d[0] += -float(change.sum()) - last
     v_d[-1] += last
     return v_d
+
+
+def slews_by_versines(deviation: ArrayLike, cutoff: float) -> FloatArray:
+    """Slews of the versine method along a base line: to it, or to a smoothed course beside it.
+
+    The versines of the deviation are those measured less those of the base line. To reach the base line they are brought to zero;
+    otherwise they are smoothed (Whittaker), so that curves of the base line stay curves however sharp they are. Both ends stay.
+
+    Parameters
+    ----------
+    deviation : (n,) array
+        Of the track to the right of the base line, m, at points half a chord apart.
+    cutoff : float
+        Wave that smoothing halves, in half chords; NaN to reach the base line.
+
+    Returns
+    -------
+    (n,) array
+        To the right, m; empty where fewer than 8 points or a cut-off of less than two half chords leave nothing to smooth.
+
+    Examples
+    --------
+    >>> bump = 0.01 * np.exp(-(((np.arange(21) - 10.0) / 3.0) ** 2))
+    >>> bool(np.abs(bump + slews_by_versines(bump, float("nan"))).max() < 1e-6)
+    True
+    """
+    from railnav.monitoring.smoothing import whittaker
+
+    y = np.asarray(deviation, float)
+    if len(y) < 8 or cutoff <= 2.0:
+        return np.empty(0)
+    own = np.zeros(len(y))
+    own[1:-1] = 0.5 * (y[:-2] + y[2:]) - y[1:-1]
+    aim = np.zeros(len(y)) if math.isnan(cutoff) else whittaker(own, 1.0, cutoff)
+    return hallade(own, closed_versines(own, aim)).slew

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 #: Resolution of values that travel along for zooming, mm.
-FINE = 0.01
+RESOLUTION = 0.01
 BEFORE, AFTER, MOVE = "#9aa7b1", "#1f77b4", "#d9822b"
 
 
@@ -55,13 +55,13 @@ def lining_page(plan: LiningPlan, *, simulated: bool = False) -> str:
         lead += f" and lifts of up to {words.length(float(plan.lift.max()), 3)}"
     lead += ". "
     if plan.measured.runs:
-        lead += (
-            f"The track was measured by {words.count(len(plan.measured.runs), 'run')}, its place good to "
-            f"{words.length(plan.measured.sigma_right, 2)} across and {words.length(plan.measured.sigma_up, 2)} in height (one sigma)."
-        )
+        lead += f"The track was measured by {words.count(len(plan.measured.runs), 'run')}, its place good to {good_to(plan)} (one sigma)."
+    else:
+        lead += f"What was measured is the model's own axis, good to {good_to(plan)} (one sigma)."
     known = plan.sigma_slew[np.isfinite(plan.sigma_slew)]
     if len(known):
-        lead += f" By the noise of its sensors a slew is good to {words.length(float(np.median(known)), 2)}."
+        lead += f" A slew is good to {words.length(float(np.median(known)), 2)}"
+        lead += " by the noise of the sensors." if plan.measured.runs else "."
     warnings = list(plan.notes)
     sections = [Section("What to know first", "", [Warnings(warnings)])] if warnings else []
     sections += [
@@ -69,7 +69,8 @@ def lining_page(plan: LiningPlan, *, simulated: bool = False) -> str:
         Section(
             "Along the line",
             "Right and up are positive as distance grows. Grey is before, blue after, orange what is to be moved. "
-            "Diamonds are fixed points. The dotted line is the slew of the versine method.",
+            "Diamonds are fixed points. The dotted line is the slew of the versine method. Below stand alignment and longitudinal level in "
+            "their bands, before and after. Drag across the chart to zoom in; a double click leads back.",
             [strips(plan)],
         ),
         _spread(plan),
@@ -84,7 +85,9 @@ def lining_page(plan: LiningPlan, *, simulated: bool = False) -> str:
         ),
         Card(
             "Greatest lift", words.length(float(plan.lift.max()), 3), f"limit {words.length(plan.limits.most_lift, 3)}"
-        ),
+        )
+        if np.isfinite(plan.lift).all()
+        else Card("Greatest lift", "none", "no heights"),
         Card("Nodes", f"{len(plan.distance):,}", f"each {plan.distance[1] - plan.distance[0]:g} m"),
     ]
     return page(
@@ -97,8 +100,15 @@ def lining_page(plan: LiningPlan, *, simulated: bool = False) -> str:
     )
 
 
+def good_to(plan: LiningPlan) -> str:
+    """What the place of the measured axis is good to, in words."""
+    across, up = plan.measured.sigma_right, plan.measured.sigma_up
+    said = f"{words.length(across, 2)} across" if np.isfinite(across) else "an unknown amount across"
+    return f"{said} and {words.length(up, 2)} in height" if np.isfinite(up) else f"{said}; heights are not known"
+
+
 def strips(plan: LiningPlan) -> Figure:
-    """Draw the plan along the line, one strip above another.
+    """Draw the plan along the line, and the channels before and after it, one strip above another.
 
     Parameters
     ----------
@@ -108,33 +118,48 @@ def strips(plan: LiningPlan) -> Figure:
     -------
     Figure
     """
-    d = plan.distance
+    fine = plan.fine
+    d = fine.distance
     x, _ = axis_of(plan.section, d)
-    classic = Curve(
-        "versine method", np.interp(plan.hallade_distance, d, x), 1e3 * plan.hallade_slew, figures.SOFT, "dot"
-    )
     target = "target" if plan.design else "base"
     drawn = [
         Strip("Model's curvature, 1/km", [Curve("curvature", x, 1e3 * plan.section.at(d).curvature, figures.INK)]),
-        _before_after(f"Right of the {target} line, mm", x, plan.right_before, plan.right_after),
+        _before_after(f"Right of the {target} line, mm", x, fine.right, fine.right + fine.slew),
         Strip(
             "Slew to the right, mm",
-            [Curve("slew", x, 1e3 * plan.slew, MOVE, fine=FINE), *([classic] if len(plan.hallade_slew) else [])],
+            [Curve("slew", x, 1e3 * fine.slew, MOVE, fine=RESOLUTION), *_strung(plan, d, x)],
             _fixed(plan.fixed_slew, d, x),
         ),
-        _before_after("Versine on 20 m, mm", x, plan.versine_before, plan.versine_after),
+        _before_after("Versine on 20 m, mm", x, fine.versine_before, fine.versine_after),
     ]
-    if np.isfinite(plan.lift).all():
+    if np.isfinite(fine.lift).all():
         drawn += [
-            _before_after(f"Above the {target} profile, mm", x, plan.up_before, plan.up_after),
-            Strip("Lift, mm", [Curve("lift", x, 1e3 * plan.lift, MOVE, fine=FINE)], _fixed(plan.fixed_lift, d, x)),
+            _before_after(f"Above the {target} profile, mm", x, fine.up, fine.up + fine.lift),
+            Strip(
+                "Lift, mm", [Curve("lift", x, 1e3 * fine.lift, MOVE, fine=RESOLUTION)], _fixed(plan.fixed_lift, d, x)
+            ),
         ]
-    return stack(drawn, identity="strips", section=plan.section, distance=d, height=140, legend=False)
+    drawn += [
+        _before_after(f"{name.replace('_', ' ').capitalize()} {band}, mm", x, before, after, form=".2f")
+        for (name, band), (before, after) in fine.channels.items()
+    ]
+    return stack(drawn, identity="strips", section=plan.section, distance=d, height=120, legend=False)
 
 
-def _before_after(name: str, x: FloatArray, before: FloatArray, after: FloatArray) -> Strip:
-    curves = [Curve("before", x, 1e3 * before, BEFORE, fine=FINE), Curve("after", x, 1e3 * after, AFTER, fine=FINE)]
-    return Strip(name, curves, form=".1f")
+def _strung(plan: LiningPlan, distance: FloatArray, x: FloatArray) -> list[Curve]:
+    """Slews of the versine method, where there are any."""
+    if not len(plan.hallade_slew):
+        return []
+    at = np.interp(plan.hallade_distance, distance, x)
+    return [Curve("versine method", at, 1e3 * plan.hallade_slew, figures.SOFT, "dot")]
+
+
+def _before_after(name: str, x: FloatArray, before: FloatArray, after: FloatArray, *, form: str = ".1f") -> Strip:
+    curves = [
+        Curve("before", x, 1e3 * before, BEFORE, fine=RESOLUTION),
+        Curve("after", x, 1e3 * after, AFTER, fine=RESOLUTION),
+    ]
+    return Strip(name, curves, form=form)
 
 
 def _fixed(points: Sequence[FixedPoint], distance: FloatArray, x: FloatArray) -> list[dict[str, Any]]:

@@ -20,7 +20,15 @@ from railnav.monitoring.filters import (
     resample,
     spikes,
 )
-from railnav.monitoring.versines import Chord, closed_versines, hallade, restore, versines, versines_in_plan
+from railnav.monitoring.versines import (
+    Chord,
+    closed_versines,
+    hallade,
+    restore,
+    slews_by_versines,
+    versines,
+    versines_in_plan,
+)
 
 STEP = 0.25
 S = np.arange(0.0, 3000.0, STEP)
@@ -212,3 +220,19 @@ def test_hallade_refuses_what_does_not_fit():
         hallade([0.0, 1.0, 2.0], [0.0, 1.0])
     with pytest.raises(TrackError, match="versine 1 is not finite"):
         hallade([0.0, np.nan, 2.0], [0.0, 1.0, 2.0])
+
+
+def test_smoothed_versines_take_short_waves_out_and_leave_long_ones_and_both_ends():
+    s = 10.0 * np.arange(400)
+    short, long = 0.006 * np.sin(2 * np.pi * s / 50.0), 0.03 * np.sin(2 * np.pi * s / 800.0)
+    slew = slews_by_versines(short + long, 10.0)
+    assert slew[0] == 0.0
+    assert abs(slew[-1]) < 1e-9
+    inside = slice(40, -40)
+    assert np.abs(slew + short)[inside].max() < 0.1 * 0.006
+    assert np.abs(slews_by_versines(short + long, float("nan")) + short + long)[inside].max() < 0.03
+
+
+def test_versines_are_not_smoothed_where_nothing_is_left_to_smooth():
+    assert len(slews_by_versines(np.zeros(7), 10.0)) == 0
+    assert len(slews_by_versines(np.zeros(50), 2.0)) == 0

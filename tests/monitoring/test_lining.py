@@ -12,12 +12,14 @@ from recorded import TRACK, design_of, fields, line, recorded, solved
 from railnav.errors import InputError, TrackError
 from railnav.io.lining import read_fixed_points, write_plan
 from railnav.monitoring.filters import D1, D2, D3_ALIGNMENT, band_pass
-from railnav.monitoring.lining import LiningLimits, line_up
+from railnav.monitoring.lining import LiningLimits, line_up, usual_limits
 from railnav.monitoring.position import MeasuredAxis, band_sigma, measured_axis, stretch_of
 from railnav.monitoring.recording import record
 from railnav.monitoring.section import onto, passages_of, section_of
 from railnav.monitoring.smoothing import Bounds, FixedPoint, InfeasibleError, corrections, feasible, whittaker
 from railnav.track.model import MilePosts
+
+BANDS = ("D1", "D2", "D3")
 
 
 def section():
@@ -372,6 +374,56 @@ def test_the_versine_method_is_held_beside_the_programme():
     strings, programme = plan.hallade_spread["alignment", "D2"], plan.spread["alignment", "D2"]
     assert strings[1] < 0.7 * strings[0]
     assert programme[1] < strings[1]  # both take waves out; the programme keeps its limits and does it better
+
+
+def test_the_versine_method_lines_the_track_and_not_its_curves():
+    """The section bends by 1/900 m: curves of the model stay curves, and slews stay as small as what is lined out."""
+    rng = np.random.default_rng(8)
+    y = 0.004 * np.convolve(rng.standard_normal(6000), np.ones(30) / 6.0, mode="same")
+    plan = line_up(axis(y))
+    assert np.abs(section().at(plan.distance).curvature).max() > 1e-3
+    assert np.abs(plan.hallade_slew).max() < 3.0 * np.abs(y).max()
+    assert plan.hallade_spread["alignment", "D3"][1] < 1.1 * plan.hallade_spread["alignment", "D3"][0]
+
+
+def test_a_short_cut_off_leaves_the_versine_method_out_and_nothing_else():
+    rng = np.random.default_rng(9)
+    plan = line_up(axis(0.002 * rng.standard_normal(1600)), cutoff=20.0, step=1.0)
+    assert len(plan.hallade_slew) == 0
+    assert plan.spread["alignment", "D1"][1] < plan.spread["alignment", "D1"][0]
+
+
+def test_channels_before_and_after_are_those_of_the_track_before_and_after():
+    rng = np.random.default_rng(10)
+    y = 0.004 * np.convolve(rng.standard_normal(3000), np.ones(30) / 6.0, mode="same")
+    plan = line_up(axis(y, 0.5 * y))
+    fine = plan.fine
+    assert set(fine.channels) == {(name, band) for name in ("alignment", "longitudinal_level") for band in BANDS}
+    assert fine.right == pytest.approx(y, abs=1e-8)
+    assert fine.slew[::10] == pytest.approx(plan.slew)
+    before, after = fine.channels["alignment", "D2"]
+    assert np.nanstd(before) == plan.spread["alignment", "D2"][0]
+    expected = band_pass(y + fine.slew, 0.5, D2)
+    assert after == pytest.approx(expected, abs=1e-8, nan_ok=True)
+
+
+def test_limits_suit_what_the_axis_is_known_to():
+    made = axis(np.zeros(400))
+    assert usual_limits(made)[0].most_slew == 0.10
+    assert usual_limits(replace(made, sigma_right=float("nan")))[0].most_slew == 0.10
+    coarse = replace(made, sigma_right=1.5)
+    assert usual_limits(coarse)[0].most_slew == 1.0
+    rough = 0.3 * np.sin(2 * np.pi * np.arange(4000) / 600.0)
+    plan = line_up(replace(axis(rough), sigma_right=1.5))
+    assert plan.cutoff == 500.0
+    assert not plan.usable
+    assert any("only show the method" in note for note in plan.notes)
+    with pytest.raises(InfeasibleError, match="show the method on such data"):
+        line_up(
+            replace(axis(rough), sigma_right=1.5),
+            limits=LiningLimits(most_slew=0.01),
+            fixed_slew=[FixedPoint("bridge", 500.0, 500.0, 0.3)],
+        )
 
 
 def test_a_smoothed_target_takes_short_waves_out_and_leaves_long_ones():
