@@ -1,18 +1,29 @@
 """Surveys that are refined: honesty by kind of survey, sequential against batch, slews found, and a real line updated.
 
-    python benchmarks/records.py [--seeds 60] [--first 5000] [--slews 40] [--json PATH]
+    python benchmarks/records.py [--scale 1.0] [--first 9000] [--only PART ...] [--json PATH]
 
-All but the last part is simulated, by the simulator of the survey's tests: three passes over 4 km, GNSS with 17 mm white noise (and 10 mm
-correlated over 60 s), gyroscopic angles of 0.2 mrad white, 2 mrad off and wandering 1e-5 rad per root second, odometers 500 ppm off.
+Some six minutes of CPU; `--scale 0.1` runs a tenth of the seeds. Each part says how much CPU time it took.
+
+All but the last two parts is simulated, by the simulator of the survey's tests: three passes over 4 km, GNSS with 17 mm white noise
+(and 10 mm correlated over 60 s), gyroscopic angles of 0.2 mrad white, 2 mrad off and wandering 1e-5 rad per root second, odometers
+500 ppm off.
 """
+
+# ruff: noqa: E402 - the thread pools read the environment when numpy is imported
 
 from __future__ import annotations
 
+import os
+
+for _pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_pool, "1")
+
 import argparse
 import json
-import os
 import sys
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +34,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "navigation"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "estimation"))
 
 import test_joint as trains
+import test_menus as menus
 import test_merging as merging
 from survey_simulator import Gyros, Receiver, axis_error, centre_line, drive, knots, plane
 from test_survey_topology import diverging
@@ -47,19 +59,24 @@ def drives(axis: Any, frame: Any, rng: Any, name: str, many: int, first: int, **
     ]
 
 
-def honesty(seeds: int, start: int) -> list[dict[str, Any]]:
+def plan(runs: list[Any]) -> list[Any]:
+    """The runs without heights: what is asked of them here is the plan, and heights cost a quarter of the time."""
+    return [replace(run, gnss=replace(run.gnss, height=None)) for run in runs]
+
+
+def honesty(builds: int, start: int) -> list[dict[str, Any]]:
     """NEES across the track, a number a knot, with the standard error of its mean over the builds, and errors, by kind of survey.
 
     Errors that are alike over minutes are few in a build of 4 km: one or two that count where angles hold the axis together. The standard
-    error says how far a mean over so many builds can be off for that reason alone.
+    error says how far a mean over so many builds can be off for that reason alone; kinds with angles get more builds for it.
     """
     rows = []
     for kind, options in KINDS.items():
         nees, square, dark = [], [], []
-        for seed in range(start, start + seeds):
+        for seed in range(start, start + (2 * builds if "correlated GNSS, angles" in kind else builds)):
             rng, frame = np.random.default_rng([seed, 7]), plane()
             axis = centre_line(seed, 4.0, frame=frame)
-            model = build(drives(axis, frame, rng, "run", 3, 0, **options))
+            model = build(plan(drives(axis, frame, rng, "run", 3, 0, **options)))
             error, sigma = axis_error(model, "up", axis)
             k = slice(20, -20)
             nees.append(np.mean((error[k] / sigma[k]) ** 2))
@@ -69,13 +86,47 @@ def honesty(seeds: int, start: int) -> list[dict[str, Any]]:
         rows.append(
             {
                 "kind": kind,
-                "runs": seeds,
+                "runs": len(nees),
                 "nees": float(np.mean(nees)),
-                "nees_sigma": float(np.std(nees) / np.sqrt(len(nees))),
+                "nees_sigma": float(np.std(nees, ddof=1) / np.sqrt(len(nees))),
                 "nees_median": float(np.median(nees)),
                 "rms_mm": float(1e3 * np.sqrt(np.median(square))),
                 "dark_mm": float(1e3 * np.median(dark)),
             }
+        )
+    return rows
+
+
+def five_runs(cases: int) -> dict[str, float]:
+    """Five runs over one kilometre merged one after the other against all rows at once (the witness: one dense chain of all rows)."""
+    worst = spread = 0.0
+    for case in range(cases):
+        truth, rng = merging.axis()[0], np.random.default_rng([case, 2])
+        runs = [merging.survey(truth, truth, rng) for _ in range(5)]
+        solution = solve_chain(runs[0])
+        for run in runs[1:]:
+            solution = solve_chain(merge_chain(ChainRecords.of(solution), run))
+        batch = solve_chain(merging.together(runs))
+        worst = max(worst, float(np.abs(solution.state - batch.state).max()))
+        spread = max(spread, float(np.abs(solution.sigma - batch.sigma).max()))
+    return {"cases": cases, "largest_difference_m": worst, "largest_difference_of_sigma_m": spread}
+
+
+def drifting(surveys: int) -> list[dict[str, float]]:
+    """Increments whose errors drift: the menu of three that calls them white, and the menu of six that follows the drift."""
+    rows = []
+    found: dict[str, list[tuple[float, float]]] = {"n = 3, white": [], "n = 6, drifts": []}
+    rng = np.random.default_rng(505)
+    for _ in range(surveys):
+        survey = menus.Survey(rng, drifting=True, correlated=False)
+        white = float(np.hypot(menus.SIGMA_STEP, 2.5e-4))
+        found["n = 3, white"].append(menus.judge(survey.solve(drift=False, correlated=False, step_sigma=white)))
+        found["n = 6, drifts"].append(menus.judge(survey.solve(drift=True, correlated=False)))
+    for name, told in found.items():
+        nees, size = np.mean(told, axis=0)
+        error = float(np.std([t[0] for t in told], ddof=1) / np.sqrt(surveys))
+        rows.append(
+            {"menu": name, "surveys": surveys, "nees": float(nees), "nees_sigma": error, "rms_mm": 1e3 * float(size)}
         )
     return rows
 
@@ -192,12 +243,20 @@ def zones(cases: int) -> list[dict[str, float]]:
     exact = np.zeros(len(truth), bool)
     exact[480:541] = True
     rows: dict[int, dict[str, list[float]]] = {p: {"naive": [], "flagged": [], "known": []} for p in (1, 2, 3)}
+    bound: dict[int, list[float]] = {p: [] for p in rows}
+    false = dict.fromkeys(rows, 0)
     for case in range(cases):
         if case % 20 == 0:
             stored = merging.model_of(5, truth, rng)
             old = stored.solve()
         runs = [merging.survey(slewed, truth, rng) for _ in range(3)]
+        still = [merging.survey(truth, truth, rng) for _ in range(3)]
         for passes, out in rows.items():
+            new = None
+            for run in still[:passes]:
+                seen = solve_chain(run if new is None else merge_chain(new, run))
+                new = ChainRecords.of(seen)
+            false[passes] += bool(change_test(old, seen, components=sides).changed.any())
             new = None
             for run in runs[:passes]:
                 seen = solve_chain(run if new is None else merge_chain(new, run))
@@ -208,13 +267,20 @@ def zones(cases: int) -> list[dict[str, float]]:
             for name, kept in (
                 ("naive", stored), ("flagged", stored.forgotten(test.nodes())), ("known", stored.forgotten(exact))
             ):  # fmt: skip
-                for run in runs[:passes]:
-                    solution = solve_chain(merge_chain(kept, run), covariance=False)
+                for k, run in enumerate(runs[:passes]):
+                    last = name == "known" and k == passes - 1
+                    solution = solve_chain(merge_chain(kept, run), covariance=last)
                     kept = ChainRecords.of(solution)
+                if solution.covariance is not None:
+                    P = np.einsum("ki,kij,kj->k", across, solution.covariance, across)
+                    bound[passes].append(float(P[488:533].mean()))
                 error = ((solution.state + truth - slewed) * across).sum(axis=1)[488:533]
                 out[name].append(float(np.mean(error**2)))
     return [
-        {"passes": p, "found": len(v["known"]), "cases": cases, **{f"{k}_mm": 1e3 * float(np.sqrt(np.mean(e))) for k, e in v.items()}}
+        {
+            "passes": p, "found": len(v["known"]), "cases": cases, "false_alarms": false[p],
+            "bound_mm": 1e3 * float(np.sqrt(np.mean(bound[p]))), **{f"{k}_mm": 1e3 * float(np.sqrt(np.mean(e))) for k, e in v.items()},
+        }
         for p, v in rows.items()
     ]  # fmt: skip
 
@@ -335,90 +401,157 @@ def real_line() -> dict[str, Any] | None:
     return out
 
 
-def main() -> None:
-    """Print the figures, and write them as JSON where asked."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=60)
-    parser.add_argument("--first", type=int, default=5000, help="first seed of the builds")
-    parser.add_argument("--slews", type=int, default=40)
-    parser.add_argument("--json", type=Path, metavar="PATH")
-    options = parser.parse_args()
-    figures: dict[str, Any] = {"honesty": honesty(options.seeds, options.first)}
+def _print_honesty(rows: list[dict[str, Any]]) -> None:
     print("simulated                             builds    NEES  its sigma  median      RMS   worst in 400 m of tunnel")
-    for r in figures["honesty"]:
+    for r in rows:
         dark = f"{r['dark_mm']:10.0f} mm" if "tunnel" in r["kind"] else ""
         print(
             f"{r['kind']:38}{r['runs']:6d}{r['nees']:8.2f}{r['nees_sigma']:10.2f}{r['nees_median']:9.2f}{r['rms_mm']:6.1f} mm{dark}"
         )
-    figures["sequential"] = s = sequential(max(options.seeds // 3, 4))
+
+
+def _print_five_runs(r: dict[str, float]) -> None:
     print(
-        f"\nsimulated: three runs, then three more: RMS {s['first']:.1f} mm, updated {s['updated']:.1f} mm, all six built at once "
+        f"simulated: five runs of 1 km merged one by one against all rows at once, {r['cases']:.0f} cases: "
+        f"{r['largest_difference_m']:.1e} m at most, sigmas {r['largest_difference_of_sigma_m']:.1e} m (bar 1e-9)"
+    )
+
+
+def _print_drifting(rows: list[dict[str, Any]]) -> None:
+    print("simulated: increments that drift by 1e-3 and 1.5e-5 per root metre, fixes every 10 m, a gap of 200 m")
+    for r in rows:
+        print(
+            f"  {r['menu']:14} NEES / 3 {r['nees']:7.2f} (+- {r['nees_sigma']:.2f}), RMS {r['rms_mm']:5.1f} mm ({r['surveys']} surveys)"
+        )
+
+
+def _print_sequential(s: dict[str, float]) -> None:
+    print(
+        f"simulated: three runs, then three more: RMS {s['first']:.1f} mm, updated {s['updated']:.1f} mm, all six built at once "
         f"{s['batch']:.1f} mm; update and build differ by {s['ratio_median']:.2f} sigma (median of RMS ratios)"
     )
-    figures["one_by_one"] = one_by_one(max(options.seeds // 5, 2))
-    print("\nsimulated: a build on three runs, then five updates of one run each; and all eight built at once")
+
+
+def _print_one_by_one(rows: list[dict[str, Any]]) -> None:
+    print("simulated: a build on three runs, then five updates of one run each; and all eight built at once")
     print(
         "                                   NEES after 0, 1, ... updates           at once   RMS, mm: first   last   at once"
     )
-    for r in figures["one_by_one"]:
+    for r in rows:
         nees, rms = r["nees"], r["rms_mm"]
         print(
             f"{r['kind']:26}"
             + "".join(f"{v:7.2f}" for v in nees[:-1])
             + f"{nees[-1]:12.2f}{rms[0]:15.1f}{rms[-2]:7.1f}{rms[-1]:10.1f}"
         )
-    figures["turnouts"] = t = turnouts(max(options.seeds // 6, 2))
+
+
+def _print_turnouts(t: dict[str, float]) -> None:
     print(
-        f"\nsimulated: a line with a branch, twice as many runs: RMS {t['before_mm']:.1f} mm, updated {t['after_mm']:.1f} mm; "
+        f"simulated: a line with a branch, twice as many runs: RMS {t['before_mm']:.1f} mm, updated {t['after_mm']:.1f} mm; "
         f"update and build of all differ by {t['ratio']:.2f} sigma (median of {t['tracks']} tracks)"
     )
-    figures["longer"] = g = longer(max(options.seeds // 6, 2))
+
+
+def _print_longer(g: dict[str, float]) -> None:
     print(
         f"simulated: half a line made whole by update --extend: RMS {g['extended']:.1f} mm, NEES {g['nees']:.2f}, "
         f"{100 * g['share']:.1f} % of its length; all runs built at once {g['batch']:.1f} mm ({g['seeds']} lines)"
     )
-    figures["service"] = service(max(options.seeds * 2 // 3, 4))
-    print(f"\nsimulated: a map of 0.5 m learns from trains (positions 1 m), {figures['service'][0]['lines']} lines")
-    for r in figures["service"]:
+
+
+def _print_service(rows: list[dict[str, float]]) -> None:
+    print(f"simulated: a map of 0.5 m learns from trains (positions 1 m), {rows[0]['lines']} lines")
+    for r in rows:
         print(
             f"  after {r['passes']:.0f} passes  RMS {r['rms_mm']:4.0f} mm   NEES {r['nees']:.2f} (+- {r['nees_sigma']:.2f})"
         )
-    figures["zones"] = zones(5 * options.slews)
-    print("\nsimulated, the specification's case: 10 mm over 60 m, RMS on the plateau, mm")
-    print("  new runs     found     merged naively   flagged stretch forgotten   stretch known exactly")
-    for r in figures["zones"]:
-        print(
-            f"  {r['passes']:8d} {r['found']:5d} of {r['cases']:3d}{r['naive_mm']:14.2f}{r['flagged_mm']:24.2f}{r['known_mm']:24.2f}"
-        )
-    figures["slews"] = slews(options.slews)
+
+
+def _print_zones(rows: list[dict[str, float]]) -> None:
+    print("simulated, the specification's case: 10 mm over 60 m, window test over 1 km; RMS on the plateau, mm (bar 2)")
     print(
-        "\nsimulated, with angles: slew over 60 m, ramps of 8 m     found   false alarms   RMS in it, old axis   updated"
+        "  new runs      found   false alarms   merged naively   flagged forgotten   stretch known exactly   its covariance says"
     )
-    for r in figures["slews"]:
+    for r in rows:
+        print(
+            f"  {r['passes']:8d} {r['found']:4d} of {r['cases']:3d} {r['false_alarms']:6d} of {r['cases']:3d}"
+            f"{r['naive_mm']:17.2f}{r['flagged_mm']:20.2f}{r['known_mm']:24.2f}{r['bound_mm']:22.2f}"
+        )
+
+
+def _print_slews(rows: list[dict[str, Any]]) -> None:
+    print(
+        "simulated, with angles: slew over 60 m, ramps of 8 m     found   false alarms   RMS in it, old axis   updated"
+    )
+    for r in rows:
         what = f"{r['slew_mm']:.0f} mm" if r["slew_mm"] else "none"
         print(
             f"{what:>52} {r['found']:6d} of {r['cases']} {r['false_alarms']:10d}"
             f"{r['old_axis_rms_mm']:15.1f} mm{r['zone_rms_mm']:9.1f} mm"
         )
-    figures["line80"] = line = real_line()
-    if line is not None:
+
+
+def _print_line(line: dict[str, Any] | None) -> None:
+    if line is None:
+        print("line80 is not here")
+        return
+    print(
+        f"line80: built on four dates, updated with four more in {line['update_s']:.1f} s; against a build of all eight:"
+    )
+    for r in line["tracks"]:
         print(
-            f"\nline80: built on four dates, updated with four more in {line['update_s']:.1f} s; against a build of all eight:"
+            f"  {r['model']:12}{r['track']:20} RMS {r['rms_m']:.2f} m, median {r['median_m']:.2f} m, {r['in_sigmas']:.2f} sigma"
         )
-        for r in line["tracks"]:
-            print(
-                f"  {r['model']:12}{r['track']:20} RMS {r['rms_m']:.2f} m, median {r['median_m']:.2f} m, {r['in_sigmas']:.2f} sigma"
-            )
-        for r in line["repeatability"]:
-            print(
-                f"  axes of single runs of different dates, {r['receiver']}: {r['rms_m']:.2f} m RMS, median {r['median_m']:.2f} m, "
-                f"95 % {r['q95_m']:.2f} m ({r['pairs']} pairs)"
-            )
-    figures["hev_cinkota"] = lines = suburban()
-    if lines is not None:
-        print("\nhev_cinkota (phones): built on three runs, updated with two more; against a build of all five:")
-        for r in lines:
-            print(f"  {r['model']:12}{r['track']:20} RMS {r['rms_m']:.2f} m, {r['in_sigmas']:.2f} sigma")
+    for r in line["repeatability"]:
+        print(
+            f"  axes of single runs of different dates, {r['receiver']}: {r['rms_m']:.2f} m RMS, median {r['median_m']:.2f} m, "
+            f"95 % {r['q95_m']:.2f} m ({r['pairs']} pairs)"
+        )
+
+
+def _print_suburban(lines: list[dict[str, Any]] | None) -> None:
+    if lines is None:
+        print("hev_cinkota is not here")
+        return
+    print("hev_cinkota (phones): built on three runs, updated with two more; against a build of all five:")
+    for r in lines:
+        print(f"  {r['model']:12}{r['track']:20} RMS {r['rms_m']:.2f} m, {r['in_sigmas']:.2f} sigma")
+
+
+def main() -> None:
+    """Print the figures, and write them as JSON where asked."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scale", type=float, default=1.0, help="share of the seeds")
+    parser.add_argument("--first", type=int, default=9000, help="first seed of the builds judged by kind")
+    parser.add_argument("--json", type=Path, metavar="PATH")
+
+    def many(seeds: int) -> int:
+        return max(2, round(options.scale * seeds))
+
+    parts: dict[str, tuple[Callable[[], Any], Callable[[Any], None]]] = {
+        "honesty": (lambda: honesty(many(80), options.first), _print_honesty),
+        "five_runs": (lambda: five_runs(many(10)), _print_five_runs),
+        "drifting": (lambda: drifting(many(60)), _print_drifting),
+        "sequential": (lambda: sequential(many(12)), _print_sequential),
+        "one_by_one": (lambda: one_by_one(many(6)), _print_one_by_one),
+        "turnouts": (lambda: turnouts(many(6)), _print_turnouts),
+        "longer": (lambda: longer(many(6)), _print_longer),
+        "service": (lambda: service(many(20)), _print_service),
+        "zones": (lambda: zones(many(200)), _print_zones),
+        "slews": (lambda: slews(many(20)), _print_slews),
+        "line80": (real_line, _print_line),
+        "hev_cinkota": (suburban, _print_suburban),
+    }
+    parser.add_argument("--only", nargs="+", choices=list(parts), metavar="PART", help=f"of {', '.join(parts)}")
+    options = parser.parse_args()
+    figures: dict[str, Any] = {}
+    for name in options.only or parts:
+        measure, tell = parts[name]
+        begin = time.process_time()
+        figures[name] = measure()
+        tell(figures[name])
+        print(f"  ({time.process_time() - begin:.0f} s of CPU)\n", flush=True)
     if options.json:
         options.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
 
