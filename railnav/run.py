@@ -6,6 +6,7 @@ seconds since `Run.start`, strictly increasing within a stream.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -24,6 +25,71 @@ def _zeros3() -> FloatArray:
     zeros = np.zeros(3)
     zeros.flags.writeable = False
     return zeros
+
+
+@dataclass(frozen=True, slots=True)
+class GnssErrors:
+    """What a receiver's data sheet, or its owner, declares of its errors, one sigma each; NaN: not declared.
+
+    Attributes
+    ----------
+    white, correlated, frame_offset : float
+        Of a horizontal axis, m: from fix to fix; first-order Gauss-Markov; constant over a run.
+    correlation_time : float
+        Of the correlated part, s.
+    stamp : float
+        Constant offset of the time stamps, s.
+    speed_latency : float
+        Age of the speed, s.
+    speed_correlated : float
+        Correlated part of the speed's error, as a share of its stated sigma.
+    """
+
+    white: float = math.nan
+    correlated: float = math.nan
+    correlation_time: float = math.nan
+    frame_offset: float = math.nan
+    stamp: float = math.nan
+    speed_latency: float = math.nan
+    speed_correlated: float = math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class ImuErrors:
+    """What is declared of an IMU and the vehicle under it, one sigma each; NaN: not declared.
+
+    Attributes
+    ----------
+    gyro_bias, accelerometer_bias : float
+        At switch-on, rad/s and m/s^2.
+    gyro_walk, accelerometer_walk : float
+        Random walk of the biases, rad/s/sqrt(s) and m/s^2/sqrt(s).
+    gyro_scale : float
+        Scale error of the gyros.
+    mounting : float
+        What is unknown of each mounting angle, rad.
+    sway : float
+        Yaw rate that the moving vehicle adds to the track's, rad/s.
+    vibration : float
+        Density of the noise of the forward accelerometer on a moving vehicle, m/s^2/sqrt(Hz).
+    """
+
+    gyro_bias: float = math.nan
+    gyro_walk: float = math.nan
+    gyro_scale: float = math.nan
+    accelerometer_bias: float = math.nan
+    accelerometer_walk: float = math.nan
+    mounting: float = math.nan
+    sway: float = math.nan
+    vibration: float = math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class OdometerErrors:
+    """What is declared of a wheel, one sigma each; NaN: not declared: scale, and random creep with the way, m/sqrt(m)."""
+
+    scale: float = math.nan
+    creep: float = math.nan
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,6 +120,8 @@ class GnssStream:
         The plate-fixed datum that reading carried the coordinates to and that stands for WGS 84; empty where none is named.
     receiver : str
         Kind of receiver, where run.toml names it; otherwise empty.
+    errors : GnssErrors or None
+        What is declared of its errors.
     """
 
     time: FloatArray
@@ -74,6 +142,7 @@ class GnssStream:
     receiver: str = ""
     epoch: float | None = None
     fixed_to: str = ""
+    errors: GnssErrors | None = None
 
     def __len__(self) -> int:
         return len(self.time)
@@ -97,6 +166,8 @@ class ImuStream:
         Of the sensors, K.
     calibration : str
         Name of the calibration that was applied to the samples; empty if they stand as measured.
+    errors : ImuErrors or None
+        What is declared of its errors.
     """
 
     time: FloatArray
@@ -106,6 +177,7 @@ class ImuStream:
     mounting: FloatArray = field(default_factory=_zeros3)
     temperature: FloatArray | None = None
     calibration: str = ""
+    errors: ImuErrors | None = None
 
     def __len__(self) -> int:
         return len(self.time)
@@ -127,6 +199,8 @@ class OdometerStream:
         Standard deviation of the speed, m/s.
     signed : bool
         Whether backing up subtracts.
+    errors : OdometerErrors or None
+        What is declared of its errors.
     """
 
     time: FloatArray
@@ -134,6 +208,7 @@ class OdometerStream:
     speed: FloatArray | None = None
     sigma_speed: FloatArray | None = None
     signed: bool = False
+    errors: OdometerErrors | None = None
 
     def __len__(self) -> int:
         return len(self.time)

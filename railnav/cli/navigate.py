@@ -12,6 +12,7 @@ from railnav.errors import InputError
 
 if TYPE_CHECKING:
     from railnav.navigation.explanation import Decision
+    from railnav.run import Run
 
 
 @click.command("navigate")
@@ -39,6 +40,14 @@ if TYPE_CHECKING:
     help="How: the filter on the track; its fixed-gain substitute for small computers; or, without a map, the IMU aided by GNSS, "
     "by pseudoranges, by GNSS and wheels, or by two filters fused.",
 )
+@click.option(
+    "--sensors",
+    default="declared",
+    show_default=True,
+    metavar="declared|usual|GRADE|FILE",
+    help="Errors of the sensors: as run.toml declares them; the usual ones, whatever it declares; those of a grade that simulate "
+    "knows (survey, service, phone, mems, tactical); or a .toml with tables [gnss], [imu], [odometer].",
+)
 @click.option("--ranges", type=PATH, help="Pseudoranges for --scheme tight, .csv or .parquet.")
 @click.option("--calibration", type=PATH, help="Calibration file of the IMU, .toml, where run.toml names none.")
 @click.option("--explain", type=PATH, help="Write why tracks were chosen, .jsonl or .csv: candidates and evidence.")
@@ -51,6 +60,7 @@ def command(
     smooth: bool,
     integrity_risk: float,
     scheme: str,
+    sensors: str,
     ranges: Path | None,
     calibration: Path | None,
     explain: Path | None,
@@ -70,13 +80,18 @@ def command(
     \b
     Example:
       railnav navigate demo/service -m demo/line.gpkg -o solution.gpkg --smooth
+      railnav navigate demo/service -m demo/line.gpkg -o solution.csv --sensors service
     """  # noqa: D301
     from railnav.cli import _files
     from railnav.cli._describe import describe_solution, print_solution
     from railnav.cli._schemes import check_request, navigate_scheme
     from railnav.cli._terminal import print_json, progress
 
-    only_track = {"--explain": explain is not None, "--alternatives": alternatives}
+    only_track = {
+        "--explain": explain is not None,
+        "--alternatives": alternatives,
+        "--sensors": sensors != "declared",
+    }
     check_request(scheme, run=run, model=model, output=output, smooth=smooth, ranges=ranges, of_track=only_track)
     if scheme != "track" or model is None:
         from railnav.io.imu_calibration import calibrated_run
@@ -115,7 +130,7 @@ def command(
     from railnav.io.run import read_run
     from railnav.navigation import navigate
 
-    recorded, reference = calibrated_run(read_run(run), calibration), _files.read_model(model)
+    recorded, reference = _declaring(calibrated_run(read_run(run), calibration), sensors), _files.read_model(model)
     decisions: list[Decision] | None = None if explain is None else []
     with progress() as report:
         solution = navigate(
@@ -136,3 +151,36 @@ def command(
         print_json({**facts, "output": output, **more, **({"alternatives": beside} if beside is not None else {})})
     else:
         print_solution(facts, " and ".join(str(p) for p in (output, beside, explain) if p is not None) + " written")
+
+
+def _declaring(run: Run, sensors: str) -> Run:
+    """The run, declaring the errors that --sensors asks for."""
+    from dataclasses import replace
+
+    from railnav.io.run_contents import read_sensors
+    from railnav.run import GnssErrors, ImuErrors, OdometerErrors
+    from railnav.simulation.sensors import OUTFITS, SHEET_OUTFITS, outfit_of
+
+    told: tuple[GnssErrors | None, ImuErrors | None, OdometerErrors | None]
+    if sensors == "declared":
+        return run
+    if sensors == "usual":
+        told = None, None, None
+    elif sensors in OUTFITS or sensors in SHEET_OUTFITS:
+        outfit = outfit_of(sensors)
+        carried = (outfit.gnss, outfit.imu, outfit.odometer)
+        told = tuple(None if sensor is None else sensor.sheet for sensor in carried)  # type: ignore[assignment]
+    elif sensors.lower().endswith(".toml"):
+        told = read_sensors(Path(sensors))
+    else:
+        grades = ", ".join((*OUTFITS, *SHEET_OUTFITS))
+        raise InputError(
+            f"--sensors {sensors} is none that is known", remedy=f"declared, usual, one of {grades}, or a .toml file"
+        )
+    gnss, imu, odometer = told
+    return replace(
+        run,
+        gnss=None if run.gnss is None else replace(run.gnss, errors=gnss),
+        imu=None if run.imu is None else replace(run.imu, errors=imu),
+        odometer=None if run.odometer is None else replace(run.odometer, errors=odometer),
+    )

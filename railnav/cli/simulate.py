@@ -58,6 +58,12 @@ if TYPE_CHECKING:
     type=click.Choice(["L3G4200D", "IMU440", "RT3003", "STIM300"]),
     help="Another IMU, by its data sheet (L3G4200D: with the LSM303DLH).",
 )
+@click.option(
+    "--declare/--no-declare",
+    default=True,
+    show_default=True,
+    help="Write what the sensors' data sheets say of their errors into run.toml, where navigate reads it.",
+)
 @click.option("--balises", is_flag=True, help="Carry a reader too: the model's balises are read as they are run over.")
 @click.option("--top-speed", type=click.FloatRange(1, 400), default=120.0, show_default=True, help="Top speed, km/h.")
 @click.option(
@@ -91,6 +97,7 @@ def command(
     track_seed: int,
     start: datetime | None,
     imu: str | None,
+    declare: bool,
     balises: bool,
     top_speed: float,
     outage: tuple[str, ...],
@@ -142,7 +149,9 @@ def command(
                 reference, tracks, fields, seed=seed, outfit=carried, driving=driving, **more
             )
         else:
-            run, truth = simulate(reference, tracks, seed=seed, outfit=carried, driving=driving, **more)
+            run, truth = simulate(
+                reference, tracks, seed=seed, outfit=carried, driving=driving, declare=declare, **more
+            )
     for name, onset in faults:
         run = with_fault(run, name, start=onset, seed=seed)
     write_run(run, output, truth=truth)

@@ -77,7 +77,8 @@ def read_run(folder: str | Path, *, report: Callable[[LogSummary], None] | None 
     -----
     GNSS coordinates in another frame than WGS 84 are turned to it by the one operation that `railnav.geodesy` pins for their
     place; `GnssStream.frame` keeps the name of the frame they came in. With `fixed_to` they are carried from their `epoch` (the
-    run's start unless given) to that plate-fixed datum, so that runs of different years agree. An unsigned odometer that
+    run's start unless given) to that plate-fixed datum, so that runs of different years agree; `carried = true` says that they have
+    been already, as in what `write_run` writes. An unsigned odometer that
     falls by more than 0.1 m is refused.
 
     Examples

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -14,7 +14,16 @@ from numpy.typing import NDArray
 
 from railnav.errors import RunError
 from railnav.io.gnss_log import LOG_FORMATS
-from railnav.run import GaugeStream, GnssStream, ImuStream, OdometerStream, Run
+from railnav.run import (
+    GaugeStream,
+    GnssErrors,
+    GnssStream,
+    ImuErrors,
+    ImuStream,
+    OdometerErrors,
+    OdometerStream,
+    Run,
+)
 
 FloatArray = NDArray[np.float64]
 #: The table of contents of a run folder.
@@ -34,6 +43,41 @@ class StreamEntry(Struct):
     time_offset_s: Annotated[float, Meta(ge=-1e7, le=1e7)] = 0.0
 
 
+_Sigma = Annotated[float, Meta(ge=0.0, le=1e6)]
+
+
+class GnssErrorsEntry(Struct, forbid_unknown_fields=True):
+    """Table [gnss.errors]: what is declared of the receiver."""
+
+    white_m: _Sigma | None = None
+    correlated_m: _Sigma | None = None
+    correlation_time_s: Annotated[float, Meta(gt=0.0, le=1e6)] | None = None
+    frame_offset_m: _Sigma | None = None
+    stamp_s: _Sigma | None = None
+    speed_latency_s: _Sigma | None = None
+    speed_correlated: _Sigma | None = None
+
+
+class ImuErrorsEntry(Struct, forbid_unknown_fields=True):
+    """Table [imu.errors]: what is declared of the IMU and the vehicle."""
+
+    gyro_bias_rad_s: _Sigma | None = None
+    gyro_walk_rad_s_sqrt_s: _Sigma | None = None
+    gyro_scale: _Sigma | None = None
+    accelerometer_bias_m_s2: _Sigma | None = None
+    accelerometer_walk_m_s2_sqrt_s: _Sigma | None = None
+    mounting_deg: _Sigma | None = None
+    sway_rad_s: _Sigma | None = None
+    vibration_m_s2_sqrt_hz: _Sigma | None = None
+
+
+class OdometerErrorsEntry(Struct, forbid_unknown_fields=True):
+    """Table [odometer.errors]: what is declared of the wheel."""
+
+    scale: _Sigma | None = None
+    creep_m_sqrt_m: _Sigma | None = None
+
+
 class GnssEntry(StreamEntry):
     """Table [gnss]."""
 
@@ -41,8 +85,10 @@ class GnssEntry(StreamEntry):
     epoch: Any = None
     fixed_to: str = ""
     plate: str = ""
+    carried: bool = False
     receiver: str = ""
     lever_arm_m: _Vector = (0.0, 0.0, 0.0)
+    errors: GnssErrorsEntry | None = None
 
 
 class ImuEntry(StreamEntry):
@@ -51,12 +97,14 @@ class ImuEntry(StreamEntry):
     lever_arm_m: _Vector = (0.0, 0.0, 0.0)
     mounting_deg: _Vector = (0.0, 0.0, 0.0)
     calibration: str = ""
+    errors: ImuErrorsEntry | None = None
 
 
 class OdometerEntry(StreamEntry):
     """Table [odometer]."""
 
     signed: bool = False
+    errors: OdometerErrorsEntry | None = None
 
 
 class GaugeEntry(StreamEntry):
@@ -82,6 +130,14 @@ class Contents(Struct):
     gyro_angles: StreamEntry | None = None
     gauge: GaugeEntry | None = None
     balise: StreamEntry | None = None
+
+
+class SensorsEntry(Struct, forbid_unknown_fields=True):
+    """A file of declared errors: the tables of a run.toml's streams, without their [stream.errors] prefix."""
+
+    gnss: GnssErrorsEntry | None = None
+    imu: ImuErrorsEntry | None = None
+    odometer: OdometerErrorsEntry | None = None
 
 
 STREAMS = ("gnss", "imu", "odometer", "gyro_angles", "gauge", "balise")
@@ -204,6 +260,77 @@ def _vector(values: FloatArray, decimals: int) -> str:
     return f"[{', '.join(repr(float(value)) for value in np.round(values, decimals) + 0.0)}]"
 
 
+#: Keys of the tables of errors, by the names of their values.
+_DECLARED = {
+    GnssErrors: {
+        "white": "white_m",
+        "correlated": "correlated_m",
+        "correlation_time": "correlation_time_s",
+        "frame_offset": "frame_offset_m",
+        "stamp": "stamp_s",
+        "speed_latency": "speed_latency_s",
+        "speed_correlated": "speed_correlated",
+    },
+    ImuErrors: {
+        "gyro_bias": "gyro_bias_rad_s",
+        "gyro_walk": "gyro_walk_rad_s_sqrt_s",
+        "gyro_scale": "gyro_scale",
+        "accelerometer_bias": "accelerometer_bias_m_s2",
+        "accelerometer_walk": "accelerometer_walk_m_s2_sqrt_s",
+        "mounting": "mounting_deg",
+        "sway": "sway_rad_s",
+        "vibration": "vibration_m_s2_sqrt_hz",
+    },
+    OdometerErrors: {"scale": "scale", "creep": "creep_m_sqrt_m"},
+}
+_Errors = TypeVar("_Errors", GnssErrors, ImuErrors, OdometerErrors)
+
+
+def declared(kind: type[_Errors], entry: Struct | None) -> _Errors | None:
+    """Errors of a stream, SI and radians, from their table; None where there is none."""
+    if entry is None:
+        return None
+    values = {name: getattr(entry, key) for name, key in _DECLARED[kind].items()}
+    turned = {name: np.deg2rad(v) if name == "mounting" else v for name, v in values.items() if v is not None}
+    return kind(**{name: float(v) for name, v in turned.items()})
+
+
+def declared_text(errors: GnssErrors | ImuErrors | OdometerErrors) -> list[str]:
+    """Lines of a table of errors, those that are declared."""
+    lines = []
+    for name, key in _DECLARED[type(errors)].items():
+        value = float(getattr(errors, name))
+        if not np.isnan(value):
+            written = f"{np.rad2deg(value) if name == 'mounting' else value:.9g}"
+            lines.append(f"{key} = {float(written)!r}")
+    return lines
+
+
+def read_sensors(file: Path) -> tuple[GnssErrors | None, ImuErrors | None, OdometerErrors | None]:
+    """Errors of receiver, IMU and wheel from a TOML file with the tables [gnss], [imu], [odometer], keys as in run.toml.
+
+    Raises
+    ------
+    RunError
+        The file is missing or no TOML, or holds a key or a value that is none.
+    """
+    try:
+        entry = msgspec.convert(tomllib.loads(file.read_text(encoding="utf-8")), SensorsEntry)
+    except OSError as error:
+        raise RunError(f"cannot be read ({error.strerror or error})", file=file) from error
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+        raise RunError(f"is no TOML ({_one_line(error)})", file=file) from error
+    except msgspec.ValidationError as error:
+        cause, _, where = str(error).partition(" - at `$.")
+        remedy = "tables are [gnss], [imu], [odometer], keys those of [gnss.errors] and so on in run.toml"
+        raise RunError(_one_line(cause), file=file, column=where.rstrip("`") or None, remedy=remedy) from error
+    return (
+        declared(GnssErrors, entry.gnss),
+        declared(ImuErrors, entry.imu),
+        declared(OdometerErrors, entry.odometer),
+    )
+
+
 def contents_text(run: Run) -> str:
     """The run.toml of a run whose streams are written as CSV."""
     start = run.start.astimezone(UTC).isoformat().replace("+00:00", "Z")
@@ -219,8 +346,10 @@ def contents_text(run: Run) -> str:
         lines += ["", f"[{name}]", f'file = "{name}.csv"', 'format = "csv"']
         if isinstance(stream, GnssStream):
             lines.append('frame = "WGS84"')  # whatever they came in, in memory they are WGS 84
-            if stream.epoch is not None and not stream.fixed_to:
+            if stream.epoch is not None:
                 lines.append(f"epoch = {stream.epoch!r}")
+            if stream.fixed_to:
+                lines += [f"fixed_to = {quoted(stream.fixed_to)}", "carried = true"]
             if stream.receiver:
                 lines.append(f"receiver = {quoted(stream.receiver)}")
         if isinstance(stream, GnssStream | ImuStream):
@@ -231,4 +360,7 @@ def contents_text(run: Run) -> str:
             lines.append("signed = true")
         if isinstance(stream, GaugeStream) and stream.reference_rail:
             lines.append(f'reference_rail = "{stream.reference_rail}"')
+        errors = getattr(stream, "errors", None)
+        if errors is not None and (values := declared_text(errors)):
+            lines += ["", f"[{name}.errors]", *values]
     return "\n".join(lines) + "\n"

@@ -19,11 +19,23 @@ from railnav.io.run_contents import (
     ImuEntry,
     OdometerEntry,
     decimal_year,
+    declared,
     epoch_of,
     inside_folder,
 )
 from railnav.io.tables import Column, Table, Words, freeze
-from railnav.run import BaliseStream, GaugeStream, GnssStream, GyroAnglesStream, ImuStream, OdometerStream, Run
+from railnav.run import (
+    BaliseStream,
+    GaugeStream,
+    GnssErrors,
+    GnssStream,
+    GyroAnglesStream,
+    ImuErrors,
+    ImuStream,
+    OdometerErrors,
+    OdometerStream,
+    Run,
+)
 
 FloatArray = NDArray[np.float64]
 #: An unsigned odometer may fall by its noise, m, not by more.
@@ -88,7 +100,15 @@ def gnss_stream(table: Table, time: FloatArray, stream: GnssEntry, start: dateti
     height = _known(table, "height_m")
     epoch = None if stream.epoch is None else epoch_of(stream.epoch, toml)
     named = str(stream.frame)  # an EPSG code may stand as a number
-    if named != "WGS84" or stream.fixed_to:
+    if stream.carried:
+        if named != "WGS84" or not stream.fixed_to:
+            cause = (
+                "coordinates that are carried already stand in frame WGS84, with the fixed_to that they were carried to"
+            )
+            raise RunError(
+                cause, file=toml, column="gnss.carried", remedy="leave carried out, and they are carried on reading"
+            )
+    elif named != "WGS84" or stream.fixed_to:
         from railnav.geodesy.transformation import geodetic_frame
 
         try:
@@ -123,6 +143,7 @@ def gnss_stream(table: Table, time: FloatArray, stream: GnssEntry, start: dateti
         epoch=epoch,
         fixed_to=stream.fixed_to,
         receiver=stream.receiver,
+        errors=declared(GnssErrors, stream.errors),
     )
 
 
@@ -136,6 +157,7 @@ def imu_stream(table: Table, time: FloatArray, stream: ImuEntry, folder: Path) -
         lever_arm_b=_fixed(stream.lever_arm_m),
         mounting=_fixed(np.deg2rad(stream.mounting_deg).tolist()),
         temperature=None if temperature is None else freeze(temperature + CELSIUS),
+        errors=declared(ImuErrors, stream.errors),
     )
     if not stream.calibration:
         return imu
@@ -166,7 +188,8 @@ def odometer_stream(table: Table, time: FloatArray, stream: OdometerEntry) -> Od
             table.refuse(
                 int(now), "distance_m", cause, f"set signed = true under [odometer] in {CONTENTS}, or split the run"
             )
-    return OdometerStream(time, distance, speed, _known(table, "sigma_speed_m_s"), stream.signed)
+    errors = declared(OdometerErrors, stream.errors)
+    return OdometerStream(time, distance, speed, _known(table, "sigma_speed_m_s"), stream.signed, errors)
 
 
 def gyro_angles_stream(table: Table, time: FloatArray) -> GyroAnglesStream:

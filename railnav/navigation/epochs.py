@@ -161,6 +161,9 @@ def raw_table(run: Run, balises: Mapping[str, tuple[int, float]] | None = None) 
         times.append(odometer.time[wheel])
     if run.balise is not None and len(run.balise.time):
         times.append(run.balise.time)
+    latest = max(float(t[-1]) for t in times)
+    if imu is not None and len(imu) and imu.time[-1] > latest + SAME_TIME:  # the IMU goes on alone
+        times.append(imu.time[-1:])
     time = np.sort(np.concatenate(times))
     time = time[np.append(True, np.diff(time) > SAME_TIME)]
     time = _filled(time, imu)

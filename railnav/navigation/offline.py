@@ -13,6 +13,7 @@ from railnav.errors import OffModelError
 from railnav.matching import _kernels as paths
 from railnav.matching.network import balises_of
 from railnav.navigation import columns as c
+from railnav.navigation.declared import settings_of
 from railnav.navigation.engine import SLOTS, Engine
 from railnav.navigation.epochs import raw_table
 from railnav.navigation.explanation import Decision, alternatives, decisions
@@ -59,7 +60,8 @@ def navigate(
     integrity_risk : float
         Risk, per row, that the along-track error exceeds the protection level.
     settings : Settings, optional
-        What is assumed of sensors and trains; by default `Settings.of_receiver` for the receiver that the run names.
+        What is assumed of sensors and trains; by default `settings_of` the run: what it declares of its sensors, else the usual for the
+        receiver that it names.
     explain : list, optional
         Receives a `Decision` for each epoch at which what is said of the track changes: the candidates, and what each kind of evidence
         said of them. With `smooth` these are the decisions of the filter, before the smoother.
@@ -101,7 +103,7 @@ def navigate(
     m = len(raw)
     engine = Engine(
         model,
-        settings or Settings.of_receiver(gnss.receiver),
+        settings or settings_of(run),
         imu=imu is not None and len(imu) > 0,
         odometer=reads,
         speed=gnss.speed is not None,

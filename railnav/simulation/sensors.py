@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from railnav.errors import InputError
+from railnav.run import GnssErrors, ImuErrors, OdometerErrors
 
 if TYPE_CHECKING:
     from railnav.inertial.sensors import SensorGrade
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 _DEGREE = math.pi / 180.0
+#: What a data sheet declares of a receiver's stamps, s; simulated ones are exact.
+STAMP = 1e-3
 
 #: Inertial units by data sheet: the names of gyroscope and accelerometer in `railnav.inertial.sensors.GRADES`.
 IMU_SHEETS = {
@@ -90,6 +93,19 @@ class GnssSensor:
         """True sigma of the height, m."""
         return math.hypot(self.white_vertical, self.coloured_vertical)
 
+    @property
+    def sheet(self) -> GnssErrors:
+        """What its data sheet declares; stamps within a millisecond, a speed that is not smoothed."""
+        return GnssErrors(
+            white=self.white_horizontal,
+            correlated=self.coloured_horizontal,
+            correlation_time=self.correlation_time,
+            frame_offset=0.0,
+            stamp=STAMP,
+            speed_latency=0.01,
+            speed_correlated=0.0,
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class ImuSensor:
@@ -131,6 +147,19 @@ class ImuSensor:
     accelerometer_scale: float = 1e-3
     gyro_full_scale: float = math.inf
     accelerometer_full_scale: float = math.inf
+
+    @property
+    def sheet(self) -> ImuErrors:
+        """What its data sheet declares; the vehicle is rigid and follows the track, so that it does not sway."""
+        return ImuErrors(
+            gyro_bias=self.gyro_bias,
+            gyro_walk=self.gyro_bias_walk,
+            gyro_scale=self.gyro_scale,
+            accelerometer_bias=self.accelerometer_bias,
+            accelerometer_walk=self.accelerometer_bias_walk,
+            mounting=self.mounting_sigma,
+            sway=0.0,
+        )
 
     @classmethod
     def of_sheet(cls, name: str, *, interval: float = 0.01) -> ImuSensor:
@@ -205,6 +234,11 @@ class OdometerSensor:
     slip_size: float = 0.08
     slip_duration: float = 4.0
     signed: bool = False
+
+    @property
+    def sheet(self) -> OdometerErrors:
+        """What its data sheet declares."""
+        return OdometerErrors(scale=self.scale_sigma, creep=self.roughness)
 
 
 @dataclass(frozen=True, slots=True)

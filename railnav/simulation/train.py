@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any
 
@@ -140,6 +140,7 @@ def simulate(
     start: datetime = START,
     direction: str = "",
     truth_interval: float = 0.1,
+    declare: bool = False,
     progress: Progress | None = None,
 ) -> tuple[Run, Truth]:
     """Drive a train over a model and record what its sensors would have seen.
@@ -163,6 +164,8 @@ def simulate(
         As in run.toml; `start` is UTC.
     truth_interval : float
         Time between rows of truth, s.
+    declare : bool
+        Whether the run declares its sensors' errors, as their data sheets would (`Run.gnss.errors` and so on); the data are the same.
     progress : callable, optional
         Told the stage, done and total.
 
@@ -223,6 +226,8 @@ def simulate(
         else:
             read = _balises(path, motion, time, sensor, generator)
             made[name] = read if len(read.time) else None
+        if declare and name in ("gnss", "imu", "odometer"):
+            made[name] = replace(made[name], errors=sensor.sheet)
     if progress is not None:
         progress("simulating sensors", len(carried), len(carried))
     if not truth_interval > 0.0:

@@ -40,6 +40,18 @@ def test_the_start_is_the_epoch_unless_one_is_given(tmp_path):
     assert (given.gnss.epoch, given.gnss.fixed_to, plain.gnss.epoch) == (2026.5, "ETRS89", None)
 
 
+def test_what_is_carried_is_written_so_and_not_carried_again(tmp_path):
+    first = read_run(write(tmp_path / "a", 'frame = "ITRF2020"\nepoch = 2026.25\nfixed_to = "GSK-2011"'))
+    write_run(first, tmp_path / "b")
+    again = read_run(tmp_path / "b")
+    assert (again.gnss.fixed_to, again.gnss.epoch) == ("GSK-2011", 2026.25)
+    np.testing.assert_allclose(cartesian(again), cartesian(first), atol=2e-5)
+    toml = tmp_path / "b" / "run.toml"
+    toml.write_text(toml.read_text().replace('frame = "WGS84"', 'frame = "ITRF2020"'))
+    with pytest.raises(RunError, match="carried"):
+        read_run(tmp_path / "b")
+
+
 def test_one_model_has_one_datum(tmp_path):
     """Runs carried to ETRS89 and to GSK-2011 lie decimetres apart: a build of both is refused."""
     runs = [
