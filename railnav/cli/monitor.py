@@ -11,8 +11,9 @@ from railnav.cli._verb import PATH, json_option
 
 if TYPE_CHECKING:
     from railnav.monitoring.limits import Exceedance
-    from railnav.monitoring.monitor import Report
+    from railnav.monitoring.monitor import Monitored, Report
     from railnav.monitoring.quality import Segment
+    from railnav.monitoring.trends import Trend
     from railnav.monitoring.versines import Chord
 
 TABLE_ENDINGS = (".csv", ".parquet")
@@ -44,6 +45,7 @@ def _default_limits(ctx: click.Context, _: click.Parameter, value: bool) -> None
 @click.option("--channels", type=PATH, help="Also write all channels: .csv or .parquet.")
 @click.option("--exceedances", "list_file", type=PATH, help="Also write the exceedances of all runs: .csv or .parquet.")
 @click.option("--quality", type=PATH, help="Also write standard deviations and classes over 200 m: .csv or .parquet.")
+@click.option("--trends", type=PATH, help="Also write the growth of standard deviations a month: .csv or .parquet.")
 @click.option("--limits", type=PATH, help="Table of limits, .toml.  [default: standard gauge; see --default-limits]")
 @click.option(
     "--default-limits",
@@ -103,6 +105,7 @@ def command(
     channels: Path | None,
     list_file: Path | None,
     quality: Path | None,
+    trends: Path | None,
     limits: Path | None,
     tracks: str | None,
     speed: float | None,
@@ -130,7 +133,7 @@ def command(
     inputs = [model, *([limits] if limits else []), *(member for run in runs for member in _files.members(run))]
     _files.check_output(output, _files.PAGE_ENDINGS, inputs=inputs)
     taken = [output]
-    for extra in (channels, list_file, quality):
+    for extra in (channels, list_file, quality, trends):
         if extra is not None:
             _files.check_output(extra, TABLE_ENDINGS, inputs=inputs)
             if extra.resolve() in [path.resolve() for path in taken]:
@@ -177,6 +180,10 @@ def command(
         from railnav.io.geometry import write_quality
 
         write_quality(report, quality)
+    if trends is not None:
+        from railnav.io.geometry import write_trends
+
+        write_trends(report, trends)
     _files.write_text(output, page)
     written = taken
     if as_json:
@@ -187,6 +194,7 @@ def command(
                 "channels": channels,
                 "exceedances_file": list_file,
                 "quality_file": quality,
+                "trends_file": trends,
             }
         )
         return
@@ -257,17 +265,38 @@ def facts(report: Report) -> dict[str, Any]:
                     g.recording.run.id: _quality(graded)
                     for g, graded in zip(part.geometries, part.segments, strict=True)
                 },
-                "trends": {
-                    t.channel: {
-                        "significant": int(t.growth.significant.sum()),
-                        "segments": len(t.start),
-                        "noise_mm": 1e3 * t.growth.noise,
-                    }
-                    for t in part.trends
-                },
+                "trends": {t.channel: _growth(report, part, t) for t in part.trends},
             }
             for part in report.sections
         ],
+    }
+
+
+def _growth(report: Report, part: Monitored, trend: Trend) -> dict[str, Any]:
+    """Growth of one channel: over all segments, and where it is significant."""
+    from numpy import flatnonzero, isfinite, nanmedian
+
+    g = trend.growth
+    known = isfinite(g.rate)
+    grows = []
+    for i in flatnonzero(g.significant).tolist():
+        track, offset = part.section.locate(trend.start[i])
+        grows.append(
+            {
+                "track": report.model.track_id[int(track)],
+                "offset_m": float(offset),
+                "mm_month": 1e3 * g.rate[i],
+                "sigma_mm_month": 1e3 * g.sigma[i],
+                "probability": g.probability[i],
+            }
+        )
+    return {
+        "months": [float(month) for month in trend.months],
+        "segments": int(known.sum()),
+        "significant": len(grows),
+        "median_mm_month": 1e3 * float(nanmedian(g.rate)) if known.any() else None,
+        "noise_mm": 1e3 * g.noise,
+        "grows": grows,
     }
 
 
@@ -285,8 +314,6 @@ def _quality(graded: tuple[Segment, ...]) -> dict[str, dict[str, Any]]:
 
 
 def _print(report: Report, found: list[Exceedance], written: list[Path]) -> None:
-    from numpy import isfinite
-
     from railnav.cli._terminal import print_table
     from railnav.web import words
     from railnav.web.geometry import LEVEL_WORDS
@@ -318,33 +345,27 @@ def _print(report: Report, found: list[Exceedance], written: list[Path]) -> None
                 if key in SUMMARY:
                     classes = ", ".join(f"{letter} {count}" for letter, count in found_here["classes"].items())
                     sizes = [f"{found_here[name]:.2f} mm" for name in ("median", "largest")]
-                    graded.append([part.section.name, g.recording.run.id, key.replace("_", " "), *sizes, classes])
+                    graded.append([part.section.name, g.recording.run.id, words.channel(key), *sizes, classes])
     print_table(
         "Standard deviation over 200 m", ("section", "run", "channel", "median", "largest", "classes"), graded, left=3
     )
-    grown = [
-        [
-            part.section.name,
-            trend.title,
-            int(trend.growth.significant.sum()),
-            int(isfinite(trend.growth.rate).sum()),
-            f"{1e3 * trend.growth.noise:.3f} mm",
-        ]
-        for part in report.sections
-        for trend in part.trends
-        if trend.growth.significant.any()
-    ]
-    print_table("Growth", ("section", "channel", "segments that change", "of", "repeats within"), grown, left=2)
+    print_table(
+        "Growth of standard deviations, mm a month",
+        ("section", "channel", "segments that change", "of", "median", "fastest", "repeats within"),
+        _grown(report),
+        left=2,
+    )
     refused: dict[str, dict[str, None]] = {}
     for part in report.sections:
         for g in part.geometries:
             for key, reason in g.refused.items():
-                refused.setdefault(reason, {})[key.replace("_", " ")] = None
+                refused.setdefault(reason, {})[words.channel(key)] = None
     print_table(
         "Not given", ("channel", "why"), [[", ".join(keys), reason] for reason, keys in refused.items()], left=2
     )
+    latest = [e for part in report.sections for e in part.exceedances if e.run == part.latest]
     shown = []
-    for e in found[:SHOWN]:
+    for e in latest[:SHOWN]:
         factor, unit = UNITS[e.unit]
         shown.append(
             [
@@ -354,10 +375,39 @@ def _print(report: Report, found: list[Exceedance], written: list[Path]) -> None
                 e.track,
                 f"{e.offset:,.1f} m",
                 f"{factor * e.value:+.1f} {unit}",
-                f"{factor * e.limit:+.1f}",
+                f"{factor * e.limit:+.1f} {unit}",
                 f"{e.length:.1f} m",
             ]
         )
-    title = f"Exceedances ({len(shown)} of {len(found)})" if len(found) > len(shown) else "Exceedances"
+    title = f"Exceedances ({len(shown)} of {len(latest)})" if len(latest) > len(shown) else "Exceedances"
+    if len(found) > len(latest):
+        title += " of the latest run"
     print_table(title, ("channel", "limit", "run", "track", "offset", "value", "limit value", "length"), shown, left=4)
     click.echo(f"{', '.join(map(str, written))} written")
+
+
+def _grown(report: Report) -> list[list[Any]]:
+    """Channels whose standard deviation changes somewhere, fastest growth beside the median; one row where none does."""
+    from numpy import abs as size
+    from numpy import isfinite, nanargmax, nanmedian
+
+    rows: list[list[Any]] = []
+    for part in report.sections:
+        changing = [trend for trend in part.trends if trend.growth.significant.any()]
+        for trend in changing:
+            g = trend.growth
+            rows.append(
+                [
+                    part.section.name,
+                    trend.title,
+                    int(g.significant.sum()),
+                    int(isfinite(g.rate).sum()),
+                    f"{1e3 * nanmedian(g.rate):+.3f}",
+                    f"{1e3 * g.rate[nanargmax(size(g.rate))]:+.3f}",
+                    f"{1e3 * g.noise:.3f} mm",
+                ]
+            )
+        if part.trends and not changing:
+            most = max(int(isfinite(trend.growth.rate).sum()) for trend in part.trends)
+            rows.append([part.section.name, f"none of {len(part.trends)} channels", 0, most, "", "", ""])
+    return rows

@@ -1,4 +1,4 @@
-"""Tables of track geometry: channels along the line, exceedances, and quality over 200 m, CSV or Parquet."""
+"""Tables of track geometry: channels along the line, exceedances, quality over 200 m and its growth, CSV or Parquet."""
 
 from __future__ import annotations
 
@@ -174,3 +174,71 @@ def write_quality(report: Report, path: str | Path) -> int:
     with atomic_path(path) as draft:
         write_table(draft, table, decimals=decimals)
     return len(rows)
+
+
+def write_trends(report: Report, path: str | Path) -> int:
+    """Write the growth of standard deviations over segments of 200 m, one row a channel and segment.
+
+    Columns: `section, channel, track, offset_m` (where the segment begins), `distance_m, chainage_km, runs, months` (between the first run
+    and the last), `first_mm, last_mm` (standard deviations), `growth_mm_month, sigma_mm_month, probability` (of a growth this large by
+    chance), `significant` (1 or 0).
+
+    Parameters
+    ----------
+    report : Report
+    path : path
+        .csv or .parquet; replaced whole or not at all.
+
+    Returns
+    -------
+    int
+        Rows written: segments that two dates know.
+    """
+    texts: dict[str, list[str]] = {"section": [], "channel": []}
+    tracks: list[NDArray[np.int64]] = []
+    columns: dict[str, list[FloatArray]] = {}
+    for part in report.sections:
+        for trend in part.trends:
+            g = trend.growth
+            rows = np.flatnonzero(np.isfinite(g.rate))
+            start = trend.start[rows]
+            track, offset = part.section.locate(start)
+            tracks.append(np.atleast_1d(np.asarray(track, np.int64)))
+            texts["section"] += [part.section.name] * len(rows)
+            texts["channel"] += [trend.channel] * len(rows)
+            row = {
+                "offset_m": offset,
+                "distance_m": start,
+                "chainage_km": part.section.at(start).chainage / 1e3,
+                "runs": np.full(len(rows), float(len(trend.months))),
+                "months": np.full(len(rows), float(np.ptp(trend.months))),
+                "first_mm": 1e3 * trend.values[int(np.argmin(trend.months)), rows],
+                "last_mm": 1e3 * trend.values[int(np.argmax(trend.months)), rows],
+                "growth_mm_month": 1e3 * g.rate[rows],
+                "sigma_mm_month": 1e3 * g.sigma[rows],
+                "probability": g.probability[rows],
+                "significant": g.significant[rows].astype(float),
+            }
+            for name, values in row.items():
+                columns.setdefault(name, []).append(np.asarray(values, float))
+    empty = np.empty(0)
+    names = "offset_m distance_m chainage_km runs months first_mm last_mm growth_mm_month sigma_mm_month probability significant"
+    table: dict[str, FloatArray | Words] = {
+        "section": Words.of(texts["section"]),
+        "channel": Words.of(texts["channel"]),
+        "track": Words(np.concatenate([np.empty(0, np.int64), *tracks]), report.model.track_id),
+    }
+    table |= {name: np.concatenate([empty, *columns.get(name, [])]) for name in names.split()}
+    decimals = {
+        "offset_m": 1,
+        "distance_m": 1,
+        "chainage_km": 5,
+        "runs": 0,
+        "months": 2,
+        "significant": 0,
+        "probability": 8,
+    }
+    decimals |= dict.fromkeys(("first_mm", "last_mm"), 4) | dict.fromkeys(("growth_mm_month", "sigma_mm_month"), 5)
+    with atomic_path(path) as draft:
+        write_table(draft, table, decimals=decimals)
+    return len(texts["section"])

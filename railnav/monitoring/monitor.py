@@ -62,6 +62,11 @@ class Monitored:
     segments: tuple[tuple[Segment, ...], ...]
     trends: tuple[Trend, ...]
 
+    @property
+    def latest(self) -> str:
+        """The latest run, by its identifier."""
+        return max((g.recording.run for g in self.geometries), key=lambda run: run.start).id
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Report:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -168,7 +168,8 @@ def trends(geometries: Sequence[Geometry]) -> list[Trend]:
     """Growth of the standard deviation over 200 m of every banded channel that at least two dates have by the same kind of sensor.
 
     Different sensors add different noise to a standard deviation, which would show as growth: of several kinds the one with the most
-    runs counts, the latest of equals.
+    runs counts, the latest of equals. What is significant is so among all segments of all channels: a track that did not change shows any
+    growth at all in one report of twenty or so, however many channels it has.
 
     Parameters
     ----------
@@ -199,7 +200,18 @@ def trends(geometries: Sequence[Geometry]) -> list[Trend]:
         title = geometries[having[0]].channels[key].title
         begin = SEGMENT * np.arange(values.shape[1], dtype=np.float64)
         found.append(Trend(key, title, begin, months[having], values, growth(months[having], values)))
-    return found
+    return _among_all(found)
+
+
+def _among_all(found: Sequence[Trend]) -> list[Trend]:
+    """The same trends, with what is significant told over all channels together."""
+    if not found:
+        return []
+    told = false_discoveries(np.concatenate([trend.growth.probability for trend in found]), FALSE_DISCOVERY)
+    parts = np.split(told, np.cumsum([len(trend.start) for trend in found])[:-1])
+    return [
+        replace(trend, growth=replace(trend.growth, significant=part)) for trend, part in zip(found, parts, strict=True)
+    ]
 
 
 def _alike(geometries: Sequence[Geometry], key: str) -> list[int]:

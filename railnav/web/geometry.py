@@ -84,8 +84,7 @@ def geometry_page(report: Report) -> str:
     runs = {g.recording.run.id: g.recording.run for part in report.sections for g in part.geometries}
     simulated = is_simulated(report.model) or any(run.simulated for run in runs.values())
     found = [e for part in report.sections for e in part.exceedances]
-    latest = {part.section.name: _latest(part) for part in report.sections}
-    shown = [e for part in report.sections for e in part.exceedances if e.run == latest[part.section.name]]
+    shown = [e for part in report.sections for e in part.exceedances if e.run == part.latest]
     first = report.sections[0]
     places = _Places(report)
     sections: list[Section] = [_map(report, shown, places)]
@@ -158,7 +157,7 @@ def strips(part: Monitored, *, identity: str, budget: int = 0) -> Figure:
             run = geometry.recording.run
             curves.append(
                 Curve(
-                    f"{run.start:%Y-%m-%d} {run.id}",
+                    run.id if f"{run.start:%Y-%m-%d}" in run.id else f"{run.start:%Y-%m-%d} {run.id}",
                     x,
                     values,
                     figures.INK if len(newest) == 1 else figures.PALETTE[j % len(figures.PALETTE)],
@@ -256,10 +255,6 @@ def _rank(key: str) -> tuple[int, str]:
 
 def _by_date(part: Monitored) -> list[Geometry]:
     return sorted(part.geometries, key=lambda g: g.recording.run.start)
-
-
-def _latest(part: Monitored) -> str:
-    return _by_date(part)[-1].recording.run.id
 
 
 def _marks(part: Monitored, key: str, x: FloatArray, factor: float, run: str) -> list[dict[str, Any]]:
@@ -369,7 +364,8 @@ def _lead(report: Report, shown: Sequence[Exceedance]) -> str:
 
 def _table_warning(report: Report) -> list[str]:
     lines = []
-    if report.table.recalled:
+    judged = any(not v.reason for part in report.sections for row in part.verdicts for v in row)
+    if report.table.recalled and judged:
         total = len(report.table.status)
         lines.append(
             f"{report.table.recalled} of {total} entries of the table of limits are recalled, not read in their standard; they are marked "

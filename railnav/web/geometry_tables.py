@@ -19,20 +19,19 @@ SHOWN = {"m": (1e3, "mm"), "m/m": (1e3, "mm/m"), "1/m": (1e3, "1/km")}
 
 def ability_section(report: Report) -> Section:
     """Which channels and bands the runs can bear, and which not."""
-    merged: dict[tuple[str, str, str, str], list[tuple[str, Channel | None]]] = {}
+    merged: dict[tuple[str, str, str, str], list[tuple[str, Channel]]] = {}
+    wanting: dict[tuple[str, str], dict[str, None]] = {}
+    count = len({g.recording.run.id for part in report.sections for g in part.geometries})
     for part in report.sections:
         for geometry, verdicts in zip(part.geometries, part.verdicts, strict=True):
             run = geometry.recording.run.id
             for v in verdicts:
                 channel = geometry.channels.get(v.channel)
-                judged = (words.share(round(v.share, 2)) if not v.reason else "channel only") if channel else "no"
-                merged.setdefault((v.title, channel.source if channel else "", v.reason, judged), []).append(
-                    (run, channel)
-                )
-            named = {v.channel for v in verdicts}
-            for name, reason in geometry.refused.items():
-                if name not in named:
-                    merged.setdefault((name.replace("_", " "), "", reason, "no"), []).append((run, None))
+                if channel is not None:
+                    judged = words.share(round(v.share, 2)) if not v.reason else "channel only"
+                    merged.setdefault((v.title, channel.source, v.reason, judged), []).append((run, channel))
+            for key, reason in geometry.refused.items():
+                wanting.setdefault((key, reason), {})[run] = None
     text = (
         "A band is given where its shortest wave is sampled three times, and judged where the noise is at most a third of the "
         "mildest limit. Sigma is that of the samples' white noise, at most, and in bands of the place; long-wave distances from the "
@@ -41,26 +40,25 @@ def ability_section(report: Report) -> Section:
     columns = ("channel", "runs", "from", "why not judged", "sample each, m", "sigma at most", "judged")
     rows = []
     for (title, source, reason, judged), having in sorted(merged.items(), key=lambda item: item[0][0].lower()):
-        channels = [channel for _, channel in having if channel is not None]
+        channels = [channel for _, channel in having]
         runs = sorted({run for run, _ in having})
-        worst = max(channels, key=lambda c: c.sigma if np.isfinite(c.sigma) else -1.0) if channels else None
-        spacing = f"{max(c.spacing for c in channels):.2f}" if channels else ""
-        rows.append(
-            [
-                title,
-                f"{len(runs)} runs" if len(runs) > 2 else ", ".join(runs),
-                source,
-                reason,
-                spacing,
-                _sigma(worst),
-                judged,
-            ]
-        )
-    return Section("What these runs can bear", text, [Table(columns, rows, left=4)])
+        worst = max(channels, key=lambda c: c.sigma if np.isfinite(c.sigma) else -1.0)
+        spacing = f"{max(c.spacing for c in channels):.2f}"
+        named = "all" if len(runs) == count > 1 else f"{len(runs)} runs" if len(runs) > 2 else ", ".join(runs)
+        rows.append([title, named, source, reason, spacing, _sigma(worst), judged])
+    tables = [Table(columns, rows, left=4)] if rows else []
+    if wanting:
+        grouped: dict[str, list[str]] = {}
+        for (key, reason), lacking in wanting.items():
+            said = reason if len(lacking) == count else f"{', '.join(lacking)}: {reason}"
+            grouped.setdefault(said, []).append(words.channel(key))
+        lines = [[", ".join(keys), said] for said, keys in grouped.items()]
+        tables.append(Table(("not given", "why"), lines, left=2))
+    return Section("What these runs can bear", text, tables)
 
 
-def _sigma(channel: Channel | None) -> str:
-    if channel is None or not np.isfinite(channel.sigma):
+def _sigma(channel: Channel) -> str:
+    if not np.isfinite(channel.sigma):
         return ""
     factor, unit = SHOWN[channel.unit]
     return f"{words.figures(channel.sigma * factor, 2)} {unit}"

@@ -130,3 +130,17 @@ def accuracy(value: float) -> str:
     ('exact, no datum shift', 'accurate to 1.5 m')
     """
     return f"accurate to {length(value, 2)}" if value > 0 else "exact, no datum shift"
+
+
+def channel(key: str) -> str:
+    """Write the key of a channel of track geometry in words.
+
+    Examples
+    --------
+    >>> channel("longitudinal_level_left_d1"), channel("twist_3m"), channel("gauge")
+    ('Longitudinal level left D1', 'Twist 3m', 'Gauge')
+    """
+    name, _, end = key.replace("_", " ").rpartition(" ")
+    if len(end) == 2 and end[0] == "d" and end[1].isdigit():
+        end = end.upper()
+    return f"{name} {end}".strip().capitalize() if not end[:1].isupper() else f"{name.capitalize()} {end}"

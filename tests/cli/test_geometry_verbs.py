@@ -78,6 +78,32 @@ def test_monitor_writes_a_page_that_asks_nothing_of_the_network(cars, tmp_path):
     assert all(float(row["deviation_mm"]) > 0.0 for row in rows)
 
 
+def test_growth_a_month_is_told_written_and_counted(cars, tmp_path):
+    """Longitudinal level was scaled by 1.4 between 2,300 and 2,600 m in the three months between the cars."""
+    written = tmp_path / "trends.csv"
+    words = ["monitor", cars / "car-1", cars / "car-2", "-m", cars / "line.gpkg", "-o", tmp_path / "g.html"]
+    code, out, err = run(*words, "--trends", written, "--against", "model")
+    assert code == 0, err
+    assert "Growth of standard deviations, mm a month" in out
+    assert "Exceedances of the latest run" in out
+    with written.open(encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["channel"] == "longitudinal_level_d1"]
+    grows = [row for row in rows if row["significant"] == "1"]
+    assert {float(row["offset_m"]) for row in grows} >= {2400.0}
+    assert all(2050.0 < float(row["offset_m"]) < 2650.0 for row in grows)
+    fastest = max(rows, key=lambda row: float(row["growth_mm_month"]))
+    apart = float(fastest["last_mm"]) - float(fastest["first_mm"])
+    assert float(fastest["growth_mm_month"]) * float(fastest["months"]) == pytest.approx(apart, abs=1e-3)
+    code, out, err = run(*words, "--against", "model", "--json")
+    assert code == 0, err
+    told = json.loads(out)["sections"][0]["trends"]["longitudinal_level_d1"]
+    assert told["significant"] == len(told["grows"]) == len(grows)
+    assert told["months"][-1] == pytest.approx(2.96, abs=0.05)
+    code, out, err = run(*words[:2], *words[3:], "--trends", written)
+    assert code == 0, err
+    assert written.read_text(encoding="utf-8").count("\n") == 1  # one date: the header alone
+
+
 def test_monitor_in_json(cars, tmp_path):
     code, out, _ = run(
         "monitor",

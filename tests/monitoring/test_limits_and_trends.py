@@ -289,6 +289,37 @@ def test_a_stretch_that_gets_worse_is_found_and_the_others_are_not():
     assert trends(made[:1]) == []
 
 
+def test_what_is_significant_is_so_among_all_channels():
+    """Two channels of chance alone: a probability that would stand out among a few segments of one does not among those of both."""
+    from railnav.monitoring.trends import Growth, Trend, _among_all
+
+    def made(name: str, probability: list[float]) -> Trend:
+        p = np.array(probability)
+        g = Growth(np.ones(len(p)), np.ones(len(p)), p, false_discoveries(p, 0.05), 1.0, 5.0)
+        return Trend(name, name, 200.0 * np.arange(len(p)), np.array([0.0, 1.0]), np.ones((2, len(p))), g)
+
+    few, many = made("gauge_d1", [0.004, 0.5]), made("alignment_d1", [0.3, 0.6] * 40)
+    assert few.growth.significant[0]
+    assert not any(trend.growth.significant.any() for trend in _among_all([few, many]))
+    sure = _among_all([made("gauge_d1", [1e-6, 0.5]), many])
+    assert [trend.growth.significant.sum() for trend in sure] == [1, 0]
+
+
+@pytest.mark.slow
+def test_track_that_did_not_change_rarely_shows_growth_and_rates_are_covered():
+    """Five triples of dates over the same simulated track: sigma of a rate honest over all channels, no more than one false report."""
+    squares, reports = [], 0
+    for seed in range(0, 15, 3):
+        made = [geometry(70 + seed + k, month=1 + 3 * k) for k in range(3)]
+        found = trends(made)
+        reports += any(trend.growth.significant.any() for trend in found)
+        for trend in found:
+            known = np.isfinite(trend.growth.rate)
+            squares.append(np.mean((trend.growth.rate[known] / trend.growth.sigma[known]) ** 2))
+    assert 0.8 < np.mean(squares) < 1.25
+    assert reports <= 1
+
+
 # --- the whole --------------------------------------------------------------------------------------------------------
 
 
