@@ -29,8 +29,9 @@ epoch k couples to epoch k + 1 by M_k x_k + L_k x_(k+1) = u_k.
 """
 
 from railnav.estimation.bordered import BorderedSolution, solve_bordered_chain
-from railnav.estimation.chain import Chain, ChainSolution, fixed_lag, solve_chain
+from railnav.estimation.chain import Chain, solve_chain
 from railnav.estimation.chain_filter import BlockResult, ChainFilter, FilterEstimate, SweepResult
+from railnav.estimation.chain_solution import ChainSolution, fixed_lag
 from railnav.estimation.change import ChangeTest, change_test
 from railnav.estimation.consistency import Consistency, Coverage, consistency, coverage, nees
 from railnav.estimation.driven import DrivenSolution, solve_driven_chain

@@ -30,9 +30,9 @@ def forward_kernel(size: int) -> Callable[..., int]:
     """Compile the forward sweep for states of one size (loops of constant length), or for any size (0)."""
     # one signature, inputs read-only: otherwise each mixture of read-only and writable arrays would compile anew
     f1, f2, f3, i1 = _READ_ONLY
-    out_f1, out_f2, out_f3, out_i1, out_b1 = float64[::1], float64[:, ::1], float64[:, :, ::1], int64[::1], boolean[::1]
+    out_f1, out_f2, out_i1, out_b1 = float64[::1], float64[:, ::1], int64[::1], boolean[::1]
     signature = int64(
-        f3, f2, i1, f3, f3, f2, i1, int64, out_f2, f1, out_f3, out_f1, out_i1, out_b1, out_f1, out_i1, out_f2,
+        f3, f2, i1, f3, f3, f2, i1, int64, out_f2, f1, out_f2, out_f1, out_i1, out_b1, out_f1, out_i1, out_f2,
         out_f1,
     )  # fmt: skip
 
@@ -62,7 +62,8 @@ def forward_kernel(size: int) -> Callable[..., int]:
         # M, L (links | 1, q, n), u (links | 1, q), link_counts (links,): M_k x_k + L_k x_(k+1) = u_k
         # lead 1: link 0 goes before epoch 0 (a chain continued), links = N; lead 0: links = N - 1
         # triangle (n, n + 1): [R | b] of the current epoch, overwritten; limits (m + 1,): NIS by dof that a block may have
-        # out: records (links | 0, n, 2n + 1) [R_kk R_kn | d_k]; nis, dof, rejected (N,); link_nis, link_dof (links,);
+        # out: records (links | 0, size) [R_kk R_kn | d_k] by rows without the zeros left of the diagonal;
+        # nis, dof, rejected (N,); link_nis, link_dof (links,);
         # link_nis, link_dof (0,): no room, for chains whose links are expected to have no redundant rows; -2 is returned where they do
         # filtered (N | 0, n), NaN while the triangle is singular; growth (N | 0,): sum ln R-_jj - sum ln R+_jj of each epoch's
         # rows (rail 15.4), NaN where R- is singular. Returns the first broken link, or -1
@@ -207,27 +208,24 @@ def forward_kernel(size: int) -> Callable[..., int]:
                             link_dof[link] = 0
                         if store:
                             f0, f1, f2 = np.sqrt(g0), np.sqrt(g1), np.sqrt(g2)
-                            records[link, 0, 0] = f0
-                            records[link, 0, 1] = f0 * s01
-                            records[link, 0, 2] = f0 * s02
-                            records[link, 0, 3] = f0 * s03
-                            records[link, 0, 4] = f0 * s04
-                            records[link, 0, 5] = f0 * s05
-                            records[link, 0, 6] = f0 * s0
-                            records[link, 1, 0] = 0.0
-                            records[link, 1, 1] = f1
-                            records[link, 1, 2] = f1 * s12
-                            records[link, 1, 3] = f1 * s13
-                            records[link, 1, 4] = f1 * s14
-                            records[link, 1, 5] = f1 * s15
-                            records[link, 1, 6] = f1 * s1
-                            records[link, 2, 0] = 0.0
-                            records[link, 2, 1] = 0.0
-                            records[link, 2, 2] = f2
-                            records[link, 2, 3] = f2 * s23
-                            records[link, 2, 4] = f2 * s24
-                            records[link, 2, 5] = f2 * s25
-                            records[link, 2, 6] = f2 * s2
+                            records[link, 0] = f0
+                            records[link, 1] = f0 * s01
+                            records[link, 2] = f0 * s02
+                            records[link, 3] = f0 * s03
+                            records[link, 4] = f0 * s04
+                            records[link, 5] = f0 * s05
+                            records[link, 6] = f0 * s0
+                            records[link, 7] = f1
+                            records[link, 8] = f1 * s12
+                            records[link, 9] = f1 * s13
+                            records[link, 10] = f1 * s14
+                            records[link, 11] = f1 * s15
+                            records[link, 12] = f1 * s1
+                            records[link, 13] = f2
+                            records[link, 14] = f2 * s23
+                            records[link, 15] = f2 * s24
+                            records[link, 16] = f2 * s25
+                            records[link, 17] = f2 * s2
                         D[3], D[4], D[5] = e3, e4, e5
                         T[3, 4], T[3, 5], T[3, 6] = r4 * f, r5 * f, b * f
                         T[4, 5], T[4, 6], T[5, 6] = p45, q4, q5
@@ -296,13 +294,13 @@ def forward_kernel(size: int) -> Callable[..., int]:
                     if not tied:
                         broken = link
                 if store:
+                    at = 0
                     for i in range(n):
                         r = np.sqrt(D[i])
-                        for c in range(i):
-                            records[link, i, c] = 0.0
-                        records[link, i, i] = r
+                        records[link, at] = r
                         for c in range(i + 1, w):
-                            records[link, i, c] = r * T[i, c]
+                            records[link, at + c - i] = r * T[i, c]
+                        at += w - i
             if gate:
                 for i in range(n):
                     D_kept[i] = D[n + i]
@@ -452,7 +450,7 @@ def smooth_chain_kernel(size: int) -> Callable[..., int]:
     @njit(cache=True, error_model="numpy", fastmath={"contract"})  # type: ignore[untyped-decorator]
     def substitute(records: FloatArray, last: FloatArray, state: FloatArray) -> int:
         """Substitute backwards, x_k = R_kk^-1 (d_k - R_kn x_(k+1)) (rail 15.3); give k n + i of an empty pivot, or -1."""
-        # records (N - 1, n, 2n + 1), last (n, n + 1) [R | b] of the last epoch; state (N, n) out
+        # records (N - 1, size) packed by rows, last (n, n + 1) [R | b] of the last epoch; state (N, n) out
         links = records.shape[0]
         n = size if size > 0 else last.shape[0]
         for i in range(n - 1, -1, -1):
@@ -464,15 +462,16 @@ def smooth_chain_kernel(size: int) -> Callable[..., int]:
             state[links, i] = t / last[i, i]
         for k in range(links - 1, -1, -1):
             for i in range(n - 1, -1, -1):
-                pivot = records[k, i, i]
+                at = i * (2 * n) - (i * (i - 1)) // 2  # element (i, c) is at + c
+                pivot = records[k, at + i]
                 if pivot == 0.0:
                     return int(k * n + i)
                 inverse = 1.0 / pivot  # waits for nothing; the terms known last come last
-                t = records[k, i, 2 * n]
+                t = records[k, at + 2 * n]
                 for c in range(n - 1, -1, -1):
-                    t -= records[k, i, n + c] * state[k + 1, c]
+                    t -= records[k, at + n + c] * state[k + 1, c]
                 for c in range(n - 1, i, -1):
-                    t -= records[k, i, c] * state[k, c]
+                    t -= records[k, at + c] * state[k, c]
                 state[k, i] = t * inverse
         return -1
 
@@ -486,7 +485,7 @@ def covariance_chain_kernel(size: int) -> Callable[..., None]:
     @njit(cache=True, error_model="numpy", fastmath={"contract"})  # type: ignore[untyped-decorator]
     def carry(records: FloatArray, last: FloatArray, covariance: FloatArray, lag_one: FloatArray) -> None:
         """Carry covariances backwards: P_k = R_kk^-1 R_kk^-T + G_k P_(k+1) G_k^T, C_k = G_k P_(k+1) (rail 15.3)."""
-        # records (N - 1, n, 2n + 1), last (n, n + 1): pivots all positive; covariance (N, n, n), lag_one (N - 1 | 0, n, n) out
+        # records (N - 1, size) packed by rows, last (n, n + 1): pivots all positive; covariance (N, n, n), lag_one (N - 1 | 0, n, n) out
         links = records.shape[0]
         n = size if size > 0 else last.shape[0]
         root = np.zeros((n, n))
@@ -502,17 +501,17 @@ def covariance_chain_kernel(size: int) -> Callable[..., None]:
                 covariance[links, j, i] = t
         for k in range(links - 1, -1, -1):
             for j in range(n):
-                root[j, j] = 1.0 / records[k, j, j]
+                root[j, j] = 1.0 / records[k, j * (2 * n) - (j * (j - 1)) // 2 + j]
                 for i in range(j - 1, -1, -1):
                     t = 0.0
                     for c in range(i + 1, j + 1):
-                        t -= records[k, i, c] * root[c, j]
+                        t -= records[k, i * (2 * n) - (i * (i - 1)) // 2 + c] * root[c, j]
                     root[i, j] = t * root[i, i]
             for i in range(n):
                 for j in range(n):
                     t = 0.0
                     for c in range(i, n):
-                        t -= root[i, c] * records[k, c, n + j]
+                        t -= root[i, c] * records[k, c * (2 * n) - (c * (c - 1)) // 2 + n + j]
                     G[i, j] = t
             for i in range(n):
                 for j in range(n):

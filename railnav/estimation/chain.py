@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from railnav.errors import EstimationError
 from railnav.estimation import _chain_kernels, _row_kernels
+from railnav.estimation.chain_solution import ChainSolution, packed_size
 from railnav.estimation.gross_error import chi_square_limit
 
 FloatArray = NDArray[np.float64]
@@ -155,133 +156,6 @@ class Chain:
         return "the right-hand sides overflow; estimate corrections to nominal values"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ChainSolution:
-    """A chain solved.
-
-    Attributes
-    ----------
-    state : (N, n) array
-        Smoothed states: each estimated from all rows. The last one is the filter's estimate.
-    covariance : (N, n, n) array or None
-        Their covariances P_k.
-    lag_one : (N - 1, n, n) array or None
-        C_k = cov(x_k, x_(k+1)).
-    filtered : (N, n) array or None
-        Estimates from the rows up to each epoch; NaN until the rows determine them (`first_determined`).
-    nis, dof : (N,) array
-        Sum of squared residuals and number of redundant rows of each epoch's observations: nu^T S^-1 nu of the innovation,
-        chi-square with ``dof`` degrees of freedom if the model holds.
-    log_evidence : (N,) array or None
-        ln p(z_k | all rows before), but for ln |det W_k| of the whitening, which must be added where hypotheses differ in it;
-        NaN while the rows before do not determine the state (rail 15.4).
-    rejected : (N,) bool array
-        Epochs whose observations failed the gate and were left out (`nis` still says by how much).
-    coupling_nis, coupling_dof : (N - 1,) array
-        The same for coupling rows beyond those that carry the state on.
-    records : (N - 1, n, 2n + 1) array
-        [R_kk R_kn | d_k]: whitened rows that hold all the past knows of x_k given x_(k+1); (0, n, 2n + 1) if not kept.
-    triangle : (n, n + 1) array
-        [R | b] of the last epoch.
-    """
-
-    state: FloatArray
-    covariance: FloatArray | None
-    lag_one: FloatArray | None
-    filtered: FloatArray | None
-    nis: FloatArray
-    dof: IntArray
-    log_evidence: FloatArray | None
-    rejected: BoolArray
-    coupling_nis: FloatArray
-    coupling_dof: IntArray
-    records: FloatArray
-    triangle: FloatArray
-
-    @property
-    def sigma(self) -> FloatArray:
-        """Standard deviations of the states (N, n), for unit weight 1.
-
-        Raises
-        ------
-        EstimationError
-            The chain was solved without covariances.
-        """
-        if self.covariance is None:
-            raise EstimationError(
-                "the chain was solved without covariances; solve_chain(..., covariance=True) gives them"
-            )
-        return np.asarray(np.sqrt(np.einsum("kii->ki", self.covariance)))
-
-    @property
-    def sum_of_squares(self) -> float:
-        """v^T v, the minimum that the estimate attains, over the rows that were used."""
-        return float(self.nis[~self.rejected].sum() + self.coupling_nis.sum())
-
-    @property
-    def redundancy(self) -> int:
-        """Number of redundant rows that were used: rows less unknowns."""
-        return int(self.dof[~self.rejected].sum() + self.coupling_dof.sum())
-
-    @property
-    def unit_weight_rms(self) -> float:
-        """Unit-weight RMS mu = sqrt(v^T v / redundancy): 1 if the stated covariances are honest (rail 5, step 8).
-
-        Raises
-        ------
-        EstimationError
-            There are no redundant rows, so nothing can be said.
-        """
-        if self.redundancy == 0:
-            raise EstimationError("no row is redundant: the chain cannot tell how well it fits")
-        return float(np.sqrt(self.sum_of_squares / self.redundancy))
-
-    @property
-    def first_determined(self) -> int:
-        """First epoch whose filtered estimate exists.
-
-        Raises
-        ------
-        EstimationError
-            The chain was solved without filtered estimates.
-        """
-        if self.filtered is None:
-            raise EstimationError("the chain was solved without filtered estimates; solve_chain(..., filtered=True)")
-        return int(np.argmax(np.isfinite(self.filtered).all(axis=1)))
-
-    def cross_covariance(self, i: int, j: int) -> FloatArray:
-        """Covariance of two states, cov(x_i, x_j) = G_i ... G_(j-1) P_j for i <= j (rail 15.3).
-
-        Parameters
-        ----------
-        i, j : int
-            Epochs, 0 <= i <= j < N.
-
-        Returns
-        -------
-        (n, n) array
-            Covariance of x_i (rows) with x_j (columns).
-
-        Raises
-        ------
-        EstimationError
-            The epochs are not in order or not there, or the chain was solved without covariances.
-        """
-        if self.covariance is None:
-            raise EstimationError(
-                "the chain was solved without covariances; solve_chain(..., covariance=True) gives them"
-            )
-        if not len(self.records) and i < j:
-            raise EstimationError("the chain was solved without records; solve_chain(..., records=True) keeps them")
-        if not 0 <= i <= j < len(self.state):
-            raise EstimationError(f"epochs {i} and {j} are not 0 <= i <= j < {len(self.state)}")
-        n = self.state.shape[1]
-        out: FloatArray = self.covariance[j]
-        for k in range(j - 1, i - 1, -1):
-            out = np.asarray(-np.linalg.solve(self.records[k, :, :n], self.records[k, :, n : 2 * n] @ out), np.float64)
-        return out
-
-
 def solve_chain(
     chain: Chain,
     *,
@@ -313,7 +187,7 @@ def solve_chain(
     allow_breaks : bool
         Accept a link that couples nothing, as long as each part is determined by its own rows.
     records : bool
-        Keep `records`. Without them the store is that of the states alone, a sixth, and the sweep is made twice: page by page
+        Keep `records`. Without them the store is that of the states alone, a fifth, and the sweep is made twice: page by page
         backwards from triangles kept on the way. Goes with ``covariance=False``.
 
     Returns
@@ -364,12 +238,8 @@ def solve_chain(
         if records
         else _substitute_pages(chain, starts, triangle, state, gate)
     )
-    if (
-        empty >= 0
-        or not np.isfinite(state[0]).all()
-        or not np.isfinite(state[-1]).all()
-        or not np.isfinite(state).all()
-    ):
+    # extremes: NaN and infinity show in them, and no array of truth values is made
+    if empty >= 0 or not np.isfinite([state.min(), state.max()]).all():
         if empty < 0 or not np.isfinite(triangle).all():
             raise EstimationError(chain.blame())
         raise EstimationError(_undetermined(chain, *divmod(empty, n)))
@@ -388,14 +258,14 @@ def solve_chain(
         rejected=sweep.rejected,
         coupling_nis=sweep.coupling_nis,
         coupling_dof=sweep.coupling_dof,
-        records=sweep.records,
+        packed=sweep.records,
         triangle=triangle,
     )
 
 
 @dataclass(slots=True)
 class Sweep:
-    """What one forward sweep leaves; inside this room only."""
+    """What one forward sweep leaves, its records packed; inside this room only."""
 
     records: FloatArray
     nis: FloatArray
@@ -415,7 +285,7 @@ def sweep_chain(
     N, n, links, m = len(chain), chain.n, len(chain.coupling_counts), chain.z.shape[1]
     limits = np.empty(0) if gate is None else np.array([np.inf, *(chi_square_limit(i + 1, gate) for i in range(m))])
     out = Sweep(
-        records=np.empty((links if store else 0, n, 2 * n + 1)),
+        records=np.empty((links if store else 0, packed_size(n))),
         nis=np.empty(N),
         dof=np.empty(N, np.int64),
         rejected=np.empty(N, np.bool_),
@@ -469,7 +339,7 @@ def _sweep_pages(
     N, n, links = len(chain), chain.n, len(chain.coupling_counts)
     starts = np.empty((-(-N // PAGE), n, n + 1))
     out = Sweep(
-        records=np.empty((0, n, 2 * n + 1)), nis=np.empty(N), dof=np.empty(N, np.int64), rejected=np.empty(N, np.bool_),
+        records=np.empty((0, packed_size(n))), nis=np.empty(N), dof=np.empty(N, np.int64), rejected=np.empty(N, np.bool_),
         coupling_nis=np.zeros(links), coupling_dof=np.zeros(links, np.int64), filtered=np.empty((N if filtered else 0, n)),
         log_evidence=np.empty(N if evidence else 0), broken=-1,
     )  # fmt: skip
@@ -506,60 +376,6 @@ def _substitute_pages(chain: Chain, starts: FloatArray, last: FloatArray, state:
             [np.eye(n), state[first - part.lead]]
         )  # what is known of the state that the next page ends with
     return -1
-
-
-def fixed_lag(solution: ChainSolution, lag: int) -> FloatArray:
-    """Give each state as estimated from the rows up to `lag` epochs later, x_(k-lag | k) (rail 15.3).
-
-    Records are final: only the starting vector x_(k|k) of the substitution changes from epoch to epoch.
-
-    Parameters
-    ----------
-    solution : ChainSolution
-        Solved with ``filtered=True``.
-    lag : int
-        Epochs to look ahead, at least 0.
-
-    Returns
-    -------
-    (N - lag, n) array
-        x_(i | i + lag) for i = 0 ... N - lag - 1; NaN where the rows up to i + lag do not determine the state.
-
-    Raises
-    ------
-    EstimationError
-        The lag is negative or not shorter than the chain, or the chain was solved without filtered estimates.
-
-    Notes
-    -----
-    Work is O(lag n^2) per epoch. Live, and with covariances, `ChainFilter.lagged` gives the same.
-
-    Examples
-    --------
-    >>> chain = Chain(np.ones((1, 1)), [[0.0], [1.1], [1.9]], [[-1.0]], [[1.0]], [[1.0], [1.0]])
-    >>> fixed_lag(solve_chain(chain, filtered=True), 2).ravel()
-    array([0.0125])
-    """
-    if solution.filtered is None:
-        raise EstimationError("the chain was solved without filtered estimates; solve_chain(..., filtered=True)")
-    N, n = solution.state.shape
-    if not 0 <= lag < N:
-        raise EstimationError(f"lag {lag} is not within 0 to {N - 1}, the epochs of the chain")
-    if lag and len(solution.records) < N - 1:
-        raise EstimationError("the chain was solved without records; solve_chain(..., records=True) keeps them")
-    out = solution.filtered[lag:].copy()
-    good = np.isfinite(out).all(axis=1)
-    for back in range(1, lag + 1):
-        records = solution.records[lag - back : N - back]
-        # an empty pivot before the state is determined: that estimate does not exist
-        good &= (np.einsum("kii->ki", records[:, :, :n]) != 0).all(axis=1)
-        R = np.where(good[:, None, None], records[:, :, :n], np.eye(n))
-        right = records[:, :, 2 * n] - np.einsum(
-            "kij,kj->ki", records[:, :, n : 2 * n], np.where(good[:, None], out, 0.0)
-        )
-        out = np.asarray(np.linalg.solve(R, right[:, :, None])[:, :, 0])
-    out[~good] = np.nan
-    return out
 
 
 def _undetermined(chain: Chain, epoch: int, component: int) -> str:

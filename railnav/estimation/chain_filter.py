@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from railnav.errors import EstimationError
 from railnav.estimation import _chain_kernels
 from railnav.estimation.chain import Chain, Sweep, as_floats, compiled_size, prior_rows, start_triangle, sweep_chain
+from railnav.estimation.chain_solution import packed_size
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -288,7 +289,7 @@ class ChainFilter:
         if not 0 <= lag <= len(self._records):
             raise EstimationError(f"lag {lag} is not kept; {len(self._records)} epochs back are")
         n = self.n
-        records = np.array(list(self._records)[len(self._records) - lag :]).reshape(lag, n, 2 * n + 1)
+        records = np.array(list(self._records)[len(self._records) - lag :]).reshape(lag, packed_size(n))
         state = np.empty((lag + 1, n))
         empty = _chain_kernels.smooth_chain_kernel(compiled_size(n))(records, self._triangle, state)
         if empty >= 0:

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from railnav.errors import EstimationError
-from railnav.estimation.chain import ChainSolution, as_floats
+from railnav.estimation.chain import as_floats
+from railnav.estimation.chain_solution import ChainSolution
 from railnav.estimation.gross_error import chi_square_limit
 
 FloatArray = NDArray[np.float64]

@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from railnav.errors import EstimationError
 from railnav.estimation import _chain_kernels
-from railnav.estimation.chain import Chain, ChainSolution, as_floats, compiled_size, start_triangle, sweep_chain
+from railnav.estimation.chain import Chain, as_floats, compiled_size, start_triangle, sweep_chain
+from railnav.estimation.chain_solution import ChainSolution, packed_records, unpacked
 from railnav.estimation.square_root import inverse_root
 
 FloatArray = NDArray[np.float64]
@@ -91,7 +92,7 @@ class ChainRecords:
         EstimationError
             The chain was solved without keeping its records.
         """
-        if len(solution.records) < len(solution.state) - 1:
+        if len(solution.packed) < len(solution.state) - 1:
             raise EstimationError("the chain was solved without records; solve_chain(..., records=True) keeps them")
         return cls(solution.records, solution.triangle)
 
@@ -197,14 +198,15 @@ class ChainRecords:
         """
         N, n = len(self), self.n
         state = np.empty((N, n))
-        empty = _chain_kernels.smooth_chain_kernel(compiled_size(n))(self.records, self.triangle, state)
+        packed = packed_records(self.records)
+        empty = _chain_kernels.smooth_chain_kernel(compiled_size(n))(packed, self.triangle, state)
         if empty >= 0:
             k, i = divmod(empty, n)
             raise EstimationError(f"node {k}: component {i} of the state is not determined by the stored rows")
         P = C = None
         if covariance:
             P, C = np.empty((N, n, n)), np.empty((N - 1, n, n))
-            _chain_kernels.covariance_chain_kernel(compiled_size(n))(self.records, self.triangle, P, C)
+            _chain_kernels.covariance_chain_kernel(compiled_size(n))(packed, self.triangle, P, C)
         return ChainSolution(
             state=state,
             covariance=P,
@@ -216,7 +218,7 @@ class ChainRecords:
             rejected=np.zeros(N, np.bool_),
             coupling_nis=np.zeros(N - 1),
             coupling_dof=np.zeros(N - 1, np.int64),
-            records=self.records,
+            packed=packed,
             triangle=self.triangle,
         )
 
@@ -342,7 +344,7 @@ class ChainRecords:
         back = reverse_chain(self.as_chain())
         triangle = start_triangle(back.prior, self.n)
         sweep = sweep_chain(back, triangle, store=True, filtered=False, gate=None)
-        return ChainRecords(sweep.records, triangle)
+        return ChainRecords(unpacked(sweep.records, self.n), triangle)
 
 
 def merge_chain(stored: ChainRecords, chain: Chain, *, first: int = 0) -> Chain:

@@ -159,9 +159,7 @@ def find_changes(side: Side, joint: Joint, at: IntArray, slack: float, false_ala
         P = estimate.inner + lean @ border_covariance @ lean.transpose(0, 2, 1)
         C = estimate.inner_lag + lean[:-1] @ border_covariance @ lean[1:].transpose(0, 2, 1)
         new = ChainRecords.of_marginals(estimate.state, P, C).solve()
-        before = replace(
-            old, state=old.state[u : v + 1], covariance=old.covariance[u : v + 1], records=old.records[u:v]
-        )
+        before = replace(old, state=old.state[u : v + 1], covariance=old.covariance[u : v + 1], packed=old.packed[u:v])
         spacing = max(1, round(WINDOW_LENGTH / (WINDOW_NODES - 1) / side.track.nominal.step))
         window = min(WINDOW_NODES, (b - a) // spacing + 1)
         settings: dict[str, Any] = {
