@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from railnav.survey.difference import Difference
     from railnav.track.model import TrackModel
 
+#: Gross errors of an update that are printed; `--json` and the model hold up to 300.
+MOST_GROSS = 12
+
 
 def _mm(value: float | None) -> str:
     return "" if value is None else f"{value * 1e3:.1f} mm" if abs(value) < 1.0 else f"{value:.2f} m"
@@ -60,6 +63,21 @@ def print_update(entry: dict[str, Any], title: str) -> None:
         ],
         left=2,
     )
+    verdicts = entry.get("verdicts") or {"total": 0, "list": []}
+    gravest = verdicts["list"][:MOST_GROSS]
+    print_table(
+        "Gross errors" if len(gravest) == verdicts["total"] else f"Gross errors: {verdicts['total']:,} set aside, the gravest",
+        ("what", "run", "track", "why", "time, s", "offset, m", "fixes", "size", "evidence"),
+        [
+            (
+                v["what"], v["run"], v["track"], v["reason"], "" if v["time_s"] is None else f"{v['time_s']:,.1f}",
+                "" if v["offset_m"] is None else f"{v['offset_m']:,.0f}", v["fixes"] or "", words.length(v["size"], 3),
+                "" if v.get("evidence") is None else f"{v['evidence']:.0f}",
+            )
+            for v in gravest
+        ],
+        left=4,
+    )  # fmt: skip
     print_warnings(entry["warnings"])
 
 

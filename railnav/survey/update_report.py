@@ -12,6 +12,7 @@ from railnav.survey.extension import ways_in_words
 from railnav.survey.fixes import USED
 from railnav.survey.report import rejected
 from railnav.survey.stored import digest
+from railnav.survey.verdicts import verdicts_of_update
 from railnav.track.records import AxisRecords, ModelRecords
 
 if TYPE_CHECKING:
@@ -42,7 +43,9 @@ def compose(
     `new_m` (how much of it is new), `sigma_before_m`, `sigma_m`, `change_rms_m`, `change_max_m` and `changes`: stretches {`from_m`,
     `to_m`, `coordinate`, `verdict`, `shift_m`, `sigma_m`, `statistic`, `limit`, `dof`, `runs`}); `beyond`: ways of runs off the model's
     tracks ({`run`, `from_s`, `to_s`, `length_m`, `fixes`, `where`, `became`: the track that it lengthened or made, or null});
-    `receivers` (`receiver`, `offset_east_m`, `offset_north_m`, `up_m`); `warnings`: sentences in plain words.
+    `receivers` (`receiver`, `offset_east_m`, `offset_north_m`, `up_m`); `verdicts`: every gross error of the new runs
+    (`railnav.survey.verdicts`): `total` and `list`, attributions to fixes or links with the evidence of two clones; `warnings`: sentences
+    in plain words.
     """
     warnings = [*survey.warnings, *ways_in_words(beyond)]
     plan = {s.track.name: s for s in across.sides}
@@ -109,6 +112,7 @@ def compose(
         )
         if np.count_nonzero(f.reason == USED) < 0.5 * len(f):
             warnings.append(f"of run {f.run.id} less than half is used ({runs[-1]['fixes']['used']} of {len(f)} fixes)")
+    warnings += [f"run {f.run.id}: {f.attributed.unsure}" for f in survey.fixes if f.attributed and f.attributed.unsure]
     unsure = sum(part["verdict"] == "unsure" for track in told for part in track["changes"])
     if unsure:
         warnings.append(
@@ -130,6 +134,7 @@ def compose(
             }
             for c, name in enumerate(across.receivers)
         ],
+        "verdicts": verdicts_of_update(survey.fixes, [s.track for s in across.sides], sections),
         "warnings": warnings,
     }
 

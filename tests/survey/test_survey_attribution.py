@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from survey_simulator import Gyros, axis_error, centre_line, drive, plane
 
-from railnav.survey import build
+from railnav.survey import build, update
 from railnav.survey.attribution import attribute
 from railnav.survey.fixes import LINKS, USED, gather
 
@@ -168,3 +168,25 @@ def test_what_a_fix_weighs_across_depends_on_where_the_track_goes():
     hit = laid.count[0] > 0
     np.testing.assert_allclose(laid.sigma[0, hit], np.hypot(0.01 * e, 0.04 * n)[hit], rtol=0.02)
     np.testing.assert_allclose(laid.height_sigma[0, hit], 0.05)
+
+
+def test_the_update_tells_new_attributions_with_their_evidence():
+    """A slip and a bad fix of the new run, at their places on the stored track; the run that is as good as the old ones has none."""
+    runs, _, i = ridden(8, passes=4)
+    at = float(runs[2].gnss.time[-200])
+    spoilt = slipped(north(runs[2], i, 0.3), at, 1.0)
+    model = update(build(runs[:2]), [spoilt, runs[3]])
+    verdicts = model.provenance["updates"][-1]["verdicts"]
+    told = {v["what"]: v for v in verdicts["list"] if v.get("evidence") is not None}
+    assert set(told) == {"fix", "link"}
+    assert verdicts["total"] >= 2
+    for v in told.values():
+        assert (v["run"], v["track"]) == ("r2", "up")
+        assert v["evidence"] > 20
+        assert v["statistic"] > v["limit"]
+    assert told["link"]["time_s"] == pytest.approx(at, abs=2.0)
+    assert told["fix"]["time_s"] == pytest.approx(float(runs[2].gnss.time[i]), abs=0.01)
+    here = model.at("up", told["fix"]["offset_m"])
+    assert (
+        np.hypot(float(here.easting) - told["fix"]["easting_m"], float(here.northing) - told["fix"]["northing_m"]) < 1.0
+    )
