@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from railnav.errors import TrackError
+from railnav.monitoring.fitting.surveyed import SurveyNoise, noise_of_model
 from railnav.track.model import TrackModel
 
 FloatArray = NDArray[np.float64]
@@ -41,6 +42,8 @@ class Axis:
         Station of the first point, m.
     crs : str
         The plane.
+    surveyed, surveyed_height : SurveyNoise or None
+        How the points err across the track and in height, where the records of a survey say so.
     """
 
     track: str
@@ -53,6 +56,8 @@ class Axis:
     scale: float = 1.0
     start: float = 0.0
     crs: str = ""
+    surveyed: SurveyNoise | None = None
+    surveyed_height: SurveyNoise | None = None
 
 
 def axis_of_points(
@@ -139,7 +144,7 @@ def _smooth(turn: FloatArray) -> bool:
 
 
 def axis_of_model(model: TrackModel, track: str) -> Axis:
-    """Axis of a track of a model: its knots, their stated sigmas, and the plane's mean scale.
+    """Axis of a track of a model: its knots, how they err, and the plane's mean scale.
 
     Raises
     ------
@@ -159,7 +164,7 @@ def axis_of_model(model: TrackModel, track: str) -> Axis:
         stated = np.sqrt(np.maximum(np.column_stack([across, cov[:, 5]]), 0.0))
     chainage = model.chainage(np.array([index]), model.offset[own][:1])
     start = float(chainage[0])
-    return axis_of_points(
+    axis = axis_of_points(
         track,
         model.easting[own],
         model.northing[own],
@@ -170,3 +175,5 @@ def axis_of_model(model: TrackModel, track: str) -> Axis:
         start=start if np.isfinite(start) else 0.0,
         crs=model.frame.crs_wkt,
     )
+    across, up = noise_of_model(model, track)
+    return replace(axis, surveyed=across, surveyed_height=up)

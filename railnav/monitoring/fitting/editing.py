@@ -28,6 +28,8 @@ _BESIDE, _AS_LONG = 60.0, 1.5
 _POINTS = 12
 #: Points that lie closer to the axis than their noise count as if they lay this share of its square off.
 _EXACT = 0.25
+#: Where transitions hardly show, two that meet in a peak of curvature are an arc, and that weighs so much, in -2 log likelihood.
+_PEAK = 20.0
 #: Rounds of changes.
 _ROUNDS = 6
 #: A whole adjustment may come out dearer than its parts promised by this.
@@ -36,11 +38,12 @@ _SLACK = 30.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Points:
-    """Measured points (n,), m, and their noise."""
+    """Measured points (n,), m, and their noise; `known` where that is stated by a survey and not told by what is left of them."""
 
     east: FloatArray
     north: FloatArray
     noise: Noise
+    known: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,7 +136,7 @@ def tried(fit: PlanFit, edits: list[Edit], points: Points) -> PlanFit:
         return fit
     items = judgement.items_of(fit.chain)
     spacing = float(np.median(np.diff(fit.along)))
-    factor = spread(fit)
+    factor = spread(fit, points)
     good: list[tuple[float, Edit]] = []
     for edit in edits:
         found = _paying(fit, items, edit, points, spacing, factor)
@@ -190,8 +193,10 @@ def _paying(
     return gain, replace(edit, items=tuple(made))
 
 
-def spread(fit: PlanFit) -> float:
-    """What squares are divided by, so that residuals as they are found count as one each."""
+def spread(fit: PlanFit, points: Points) -> float:
+    """What squares are divided by, so that residuals as they are found count as one each; 1 where their noise is known."""
+    if points.known:
+        return 1.0
     unknown = 2 * len(fit.chain.kind) + 3
     size = fit.cost / max(len(fit.along) - unknown, 1)
     return float(np.clip(size, _EXACT, 4.0))
@@ -205,7 +210,13 @@ def refined(fit: PlanFit, points: Points, *, jump: float = 0.0) -> PlanFit:
         length_sigma, bend_sigma, _ = plan_sigmas(fit)
         items = judgement.items_of(fit.chain)
         least = 0.5 * float(np.median(np.diff(fit.along)))
-        fit = tried(fit, judgement.simplifications(items, bend_sigma, length_sigma, least=least, jump=jump), points)
+        peak = _PEAK if points.known else 0.0
+        fit = tried(
+            fit, judgement.simplifications(items, bend_sigma, length_sigma, least=least, jump=jump, peak=peak), points
+        )
+        if points.known:
+            length_sigma, _, _ = plan_sigmas(fit)
+            fit = tried(fit, judgement.without_leads(judgement.items_of(fit.chain), length_sigma), points)
         for propose in (
             judgement.hardly_bent,
             judgement.smooth_joints,

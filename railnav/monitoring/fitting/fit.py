@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from railnav.errors import EstimationError, TrackError
 from railnav.monitoring.design import Design
 from railnav.monitoring.fitting import judgement, segmentation
-from railnav.monitoring.fitting.axis import Axis
+from railnav.monitoring.fitting.axis import LEAST_POINTS, Axis
 from railnav.monitoring.fitting.cant import FittedCant, fit_cant, law_of_ramps
 from railnav.monitoring.fitting.editing import Points, plan_sigmas, refined, tried
 from railnav.monitoring.fitting.laws import OTHER_LAWS, Law, owed_to_law, prior, under_law, with_laws, with_ramps
@@ -26,6 +26,7 @@ from railnav.monitoring.fitting.plan import PlanFit, chain_of_pieces, fit_plan
 from railnav.monitoring.fitting.profile import Profile, fit_profile
 from railnav.monitoring.fitting.rounding import round_design
 from railnav.monitoring.fitting.segmentation import Noise, Pieces
+from railnav.monitoring.fitting.surveyed import HIDDEN, longest_unseen, owed_to_unseen
 from railnav.run import Progress
 from railnav.track import elements
 from railnav.track.elements import CLOTHOID
@@ -166,15 +167,17 @@ def fit_design(
     along, east, north = axis.along[rows], axis.easting[rows], axis.northing[rows]
     noise, pieces, ref, jump = _segment(axis, along, east, north, chosen, sigma)
     tell(label, 1, total)
-    points = Points(east, north, noise)
+    known = axis.surveyed is not None and sigma is None
+    points = Points(east, north, noise, known)
     fit = fit_plan(chain_of_pieces(pieces, along, ref), along, east, north, noise)
     fit = refined(_one_sided(fit, points), points, jump=jump)
-    if noise.correlated > 0.0 and not noise.smooth:
+    smooth = noise.smooth or axis.surveyed is not None
+    if noise.correlated > 0.0 and not smooth:
         noise = of_residuals(fit.along, fit.residual, noise, floor=0.2 * FLOOR, stated=sigma)
         points = Points(east, north, noise)
         fit = refined(fit_plan(fit.chain, fit.along, east, north, noise), points, jump=jump)
     tell(label, 2, total)
-    if noise.smooth:
+    if smooth:
         law = prior(laws) if (fit.chain.kind >= CLOTHOID).any() else Law({})
         law = with_ramps(law, law_of_ramps(axis, _feet_of_all(axis, rows, fit), fit.chain.plan, laws))
         fit = under_law(fit, law.best, points)
@@ -185,6 +188,12 @@ def fit_design(
         fit, law, owed = with_laws(fit, points, tried_laws, cant=cant_here)
     whole = fit
     fit = _one_sided(_without_stubs(fit, points), points)
+    if known:  # cutting leaves pieces that the points do not speak for
+        for _ in range(3):
+            before = len(fit.chain.kind)
+            fit = _one_sided(refined(fit, points, jump=jump), points)
+            if len(fit.chain.kind) == before:
+                break
     if len(fit.chain.kind) != len(whole.chain.kind):
         owed = owed_to_law(fit, law)
     tell(label, 3, total)
@@ -193,9 +202,9 @@ def fit_design(
     if not fit.settled:
         warnings.append(f"track {axis.track}: the elements did not come to rest; their sigmas may be too small")
     if "or" in law.said.split():
-        why = "its points are smoothed and do not tell" if noise.smooth else "their lengths depend on it"
+        why = "its points are smoothed and do not tell" if smooth else "their lengths depend on it"
         warnings.append(f"track {axis.track}: transitions are {law.said}; {why}, and sigmas of lengths say so")
-    factor = _as_found(fit, sigma)
+    factor = _as_found(fit, points.known or sigma is not None)
     if factor > _FAILED and sigma is None:
         raise EstimationError(
             f"track {axis.track}: no elements were found that pass the points within {_FAILED:.0f} times their noise of "
@@ -222,6 +231,12 @@ def fit_design(
     plan = fit.chain.plan
     k = np.where(plan.kind == elements.ARC, plan.curvature_start, np.nan)
     radius_sigma = bend_sigma / k**2
+    if points.known and axis.surveyed is not None:
+        of_station, of_length, of_radius = owed_to_unseen(plan, axis.surveyed.density)
+        station_sigma = np.hypot(station_sigma, of_station)
+        # a transition is at least blurred over what the survey smoothed over
+        length_sigma = np.hypot(length_sigma, np.where(plan.kind >= CLOTHOID, axis.surveyed.smoothing, of_length))
+        radius_sigma = np.hypot(radius_sigma, of_radius)
     feet = _feet_of_all(axis, rows, fit)
     profile = cant = None
     if axis.height is None:
@@ -266,6 +281,10 @@ def fit_design(
 
 def _resolution_of(axis: Axis, sigma: float | None) -> Resolution:
     spacing = float(axis.along[-1] / (len(axis.along) - 1))
+    if axis.surveyed is not None:
+        every = max(1, min(round(axis.surveyed.smoothing / spacing), len(axis.along) // LEAST_POINTS))
+        white = float(axis.surveyed.noise(every * spacing).sigma)
+        return Resolution(every, every * spacing, max(white if sigma is None else sigma, FLOOR))
 
     def across(every: int) -> FloatArray:
         found = []
@@ -288,7 +307,7 @@ def _segment(
     """Noise of the points, the pieces that they lie on, the smooth curve beside them, and how rare jumps of curvature are."""
     white = chosen.sigma
     stated = None if axis.stated is None or chosen.every == 1 else float(np.median(axis.stated[:, 0]))
-    window = float(np.clip((720.0 * chosen.spacing * white**2 / 1e-6) ** 0.2, 6.5 * chosen.spacing, 120.0))
+    window = max(min((720.0 * chosen.spacing * white**2 / 1e-6) ** 0.2, 120.0), 6.5 * chosen.spacing)
     ref = segmentation.reference(along, east, north, window)
     wide = min(max(round(20.0 / chosen.spacing), 3), len(along))
     smooth = np.convolve(ref[3], np.ones(wide) / wide, mode="same")
@@ -313,14 +332,20 @@ def _segment(
             prices=prices,
         )
 
-    if stated is not None:
+    if axis.surveyed is not None:
+        noise = replace(axis.surveyed.noise(chosen.spacing), sigma=white)
+    elif stated is not None:
         noise = likeliest_smooth(pieces, len(along), stated, floor=0.1 * FLOOR, stated=sigma)
     else:
         noise = likeliest(pieces, len(along), chosen.spacing, white, floor=FLOOR, stated=sigma)
     everything = slice(0, len(along))
 
+    unseen = axis.surveyed is not None and longest_unseen(axis.surveyed.density, bend) > HIDDEN
+
     def learnt(noise: Noise) -> tuple[float, Pieces]:
         """Pieces under a noise, at prices that this track itself teaches, and what they cost."""
+        if unseen:  # what such points do not show is built all the same
+            return 0.0, pieces(noise, everything, segmentation.BEAM, segmentation.UNSEEN)
         least: tuple[float, Pieces] | None = None
         for prices in (segmentation.RAILWAY, segmentation.TRAMWAY):
             for _ in range(3):
@@ -336,13 +361,14 @@ def _segment(
 
     cost, best = learnt(noise)
     if (
-        noise.correlated > 0.0 and not noise.smooth
+        noise.correlated > 0.0 and not noise.smooth and axis.surveyed is None
     ):  # the whole track may know better than its samples that there are no waves
         plain = Noise(white)
         cost_plain, other = learnt(plain)
         if cost_plain - cost + 2.0 * len(along) * float(np.log(white / np.mean(noise.sigma))) < WAVES_WORTH:
             noise, best = plain, other
-    return noise, best, ref, segmentation.rarity_of_jumps(segmentation.learnt(best, len(along)))
+    prices = segmentation.UNSEEN if unseen else segmentation.learnt(best, len(along))
+    return noise, best, ref, segmentation.rarity_of_jumps(prices)
 
 
 def _one_sided(fit: PlanFit, points: Points) -> PlanFit:
@@ -380,11 +406,11 @@ def _without_stubs(fit: PlanFit, points: Points) -> PlanFit:
     return fit
 
 
-def _as_found(fit: PlanFit, sigma: float | None) -> float:
-    """How many times larger residuals are than the noise was thought to be; never less than 1 where the user states it."""
+def _as_found(fit: PlanFit, stated: bool) -> float:
+    """How many times larger residuals are than the noise was thought to be; never less than 1 where that is stated."""
     unknown = 2 * len(fit.chain.kind) + 3
     factor = float(np.sqrt(fit.cost / max(len(fit.along) - unknown, 1)))
-    return max(factor, 1.0) if sigma is not None or factor < 1.0 else factor
+    return max(factor, 1.0) if stated or factor < 1.0 else factor
 
 
 def _feet_of_all(axis: Axis, rows: IntArray, fit: PlanFit) -> FloatArray:
@@ -403,9 +429,12 @@ def _shortest(chosen: Resolution, noise: Noise, plan: elements.Plan) -> float:
     """Length over which the points tell a curve of the track's median radius from a straight: 4 sigmas of curvature."""
     arcs = np.abs(plan.curvature_start[plan.kind == elements.ARC])
     bend = float(np.median(arcs)) if len(arcs) else 1e-3
-    white = float(np.mean(noise.sigma))
-    square = white**2 * chosen.spacing + 2.0 * noise.length * noise.correlated**2
-    return float((720.0 * square * (4.0 / bend) ** 2) ** 0.2)
+    white = float(np.mean(noise.sigma)) ** 2 * chosen.spacing
+    shortest = 100.0
+    for _ in range(20):  # waves count by what they have at wavelengths of about the curve
+        waves = 2.0 * noise.length * noise.correlated**2 / (1.0 + (2.0 * np.pi * noise.length / shortest) ** 2)
+        shortest = float((720.0 * (white + waves) * (4.0 / bend) ** 2) ** 0.2)
+    return shortest
 
 
 def _doubts(
@@ -437,6 +466,7 @@ def _doubts(
     if total > 0.05:
         said.append(
             f"track {axis.track}: noise of {total:.2f} m across the track shows curves longer than about {shortest:.0f} m; "
-            "shorter elements, and where transitions begin, are not in these points"
+            "shorter elements, and where transitions begin, are not in these points; a straight that meets an arc stands for the middle of a "
+            "transition which they hide"
         )
     return said

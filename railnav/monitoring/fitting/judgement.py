@@ -145,7 +145,13 @@ def split_inflections(items: list[Item]) -> list[Item]:
 
 
 def simplifications(
-    items: list[Item], bend_sigma: FloatArray, length_sigma: FloatArray, *, least: float = 0.5, jump: float = 0.0
+    items: list[Item],
+    bend_sigma: FloatArray,
+    length_sigma: FloatArray,
+    *,
+    least: float = 0.5,
+    jump: float = 0.0,
+    peak: float = 0.0,
 ) -> list[Edit]:
     """Edits that leave out what the points do not speak for; none overlaps another.
 
@@ -161,6 +167,8 @@ def simplifications(
     jump : float
         How much rarer curvature jumps than it runs on, in -2 log likelihood: a transition that may well be none weighs as little of
         that as it is shorter than its sigma.
+    peak : float
+        How much rarer transitions meet in a peak of curvature than with an arc between, in -2 log likelihood.
     """
     edits: list[Edit] = []
     free = 0
@@ -173,6 +181,12 @@ def simplifications(
         if edit is not None and item.kind >= elements.CLOTHOID and edit.fewer == 1 and len(edit.items) == 2:
             known = item.length / max(_NO_LENGTH * float(length_sigma[j]), least, 1e-9)
             edit = replace(edit, bonus=-jump * min(known, 1.0))
+        if (
+            edit is not None
+            and item.kind == elements.ARC
+            and all(part.kind >= elements.CLOTHOID for part in edit.items)
+        ):
+            edit = replace(edit, bonus=edit.bonus - peak)
         if edit is None and item.kind == elements.ARC and abs(item.k0) < NOTHING * bend_sigma[j]:
             changed = _straightened(items, j)
             edit = Edit(lo, lo + len(changed), changed, 1)
@@ -285,6 +299,26 @@ def hardly_bent(items: list[Item]) -> list[Edit]:
             continue
         bonus = _NOT_BUILT if abs(item.k0) < _NO_ARC else _ODD
         edits.append(Edit(lo, hi, _straightened(items, j), 1, bonus))
+    return edits
+
+
+def without_leads(items: list[Item], length_sigma: FloatArray) -> list[Edit]:
+    """Edits that leave out a transition which leads to, or from, an arc shorter than its sigma: the arc takes its place."""
+    edits: list[Edit] = []
+    for j, item in enumerate(items):
+        if item.kind != elements.ARC or item.length > _NO_LENGTH * length_sigma[j]:
+            continue
+        for i in (j - 1, j + 1):
+            if not 0 <= i < len(items) or items[i].kind < elements.CLOTHOID:
+                continue
+            whole = item.length + items[i].length
+            if i < j:
+                one = replace(item, length=whole, start=items[i].start, smooth=False, k0=item.k0, k1=item.k0)
+                edits.append(Edit(i, j + 1, (one,), 2))
+            else:
+                one = replace(item, length=whole)
+                rest = () if i + 1 >= len(items) else (replace(items[i + 1], smooth=False),)
+                edits.append(Edit(j, i + 1 + len(rest), (one, *rest), 2))
     return edits
 
 

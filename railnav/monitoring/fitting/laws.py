@@ -143,7 +143,7 @@ def with_laws(
     if not (fit.chain.kind >= CLOTHOID).any():
         return fit, Law({}), np.zeros(len(fit.chain.kind))
     items = judgement.items_of(fit.chain)
-    factor = spread(fit)
+    factor = spread(fit, points)
     sigma = points.noise.total if not points.noise.smooth else float(np.mean(points.noise.sigma))
     spacing = float(np.median(np.diff(fit.along)))
     cost: dict[int, float] = dict.fromkeys((CLOTHOID, *laws), 0.0)
@@ -228,7 +228,7 @@ def under_law(fit: PlanFit, law: int, points: Points) -> PlanFit:
         found = fit_plan(judgement.chain_of(items), fit.along, points.east, points.north, points.noise)
     except EstimationError:
         return fit
-    return found if found.cost / spread(fit) < fit.cost / spread(fit) + _ALONE * 2 else fit
+    return found if found.cost / spread(fit, points) < fit.cost / spread(fit, points) + _ALONE * 2 else fit
 
 
 def owed_to_law(fit: PlanFit, law: Law) -> FloatArray:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from railnav.errors import EstimationError, TrackError
 from railnav.monitoring.fitting import judgement, precision, segmentation, stretches
-from railnav.monitoring.fitting.axis import Axis
+from railnav.monitoring.fitting.axis import LEAST_POINTS, Axis
 from railnav.monitoring.fitting.noise import Resolution, likeliest, likeliest_smooth, resolution
 from railnav.monitoring.fitting.segmentation import Noise, Pieces
 from railnav.track.elements import Gradients
@@ -74,8 +74,14 @@ def fit_profile(axis: Axis, along: FloatArray, *, sigma: float | None = None, ve
         raise TrackError(f"track {axis.track!r} has no heights")
     height = axis.height
     stated = None if axis.stated is None else float(np.median(axis.stated[:, 1]))
-    chosen = resolution_of_values(height, along, FLOOR, stated)
-    smooth = stated is not None and chosen.every > 1
+    surveyed = axis.surveyed_height
+    if surveyed is None:
+        chosen = resolution_of_values(height, along, FLOOR, stated)
+    else:
+        spacing = float(along[-1] - along[0]) / (len(along) - 1)
+        every = max(1, min(round(surveyed.smoothing / spacing), len(along) // LEAST_POINTS))
+        chosen = Resolution(every, every * spacing, max(float(surveyed.noise(every * spacing).sigma), FLOOR))
+    smooth = surveyed is None and stated is not None and chosen.every > 1
     pick = np.arange(0, len(along), chosen.every)
     place = axis.along[pick]
     along, height = along[pick], height[pick]
@@ -87,7 +93,9 @@ def fit_profile(axis: Axis, along: FloatArray, *, sigma: float | None = None, ve
     def pieces(noise: Noise, part: slice, beam: int = segmentation.NARROW) -> Pieces:
         return segmentation.segment_profile(along[part], height[part], noise, bend_scale=bend, beam=beam)
 
-    if smooth and stated is not None:
+    if surveyed is not None:
+        noise = replace(surveyed.noise(chosen.spacing), sigma=chosen.sigma if sigma is None else sigma)
+    elif smooth and stated is not None:
         noise = likeliest_smooth(pieces, len(along), stated, floor=0.1 * FLOOR, stated=sigma)
     else:
         white = chosen.sigma if sigma is None else sigma

@@ -84,6 +84,8 @@ class Prices:
 RAILWAY = Prices(_PRICE, np.array([rule[3] for rule in _PLAN_RULES]))
 #: As tramways are: curvature jumps as often as not.
 TRAMWAY = Prices(_PRICE, np.array([2.0, 2.0, 1.0, 1.0, 8.0, 1.0, 2.0, 2.0, 12.0, 12.0, 12.0, 12.0]))
+#: As railways look where metre errors hide transitions: straights meet arcs, and only jumps beside a transition seen are dear.
+UNSEEN = Prices(_PRICE, np.array([0.0, 0.0, 0.0, 0.0, 20.0, 2.0, 2.0, 8.0, 25.0, 25.0, 25.0, 25.0]))
 #: Weight of what is built elsewhere beside what a track itself shows, pieces.
 _ELSEWHERE = 4.0
 _CHEAPEST, _DEAREST_PLACE = 5.0, 14.0
