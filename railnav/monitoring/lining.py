@@ -353,8 +353,14 @@ def line_up(
         hallade_distance=d[::every][: len(strung)],
         hallade_slew=strung,
         hallade_spread=strings,
-        sigma_slew=_sigma(measured.sigma_right, shape[0], measured.local_right, rows, bool(name))[nodes],
-        sigma_lift=_sigma(measured.sigma_up, shape[1], measured.local_up, rows, not free_level)[nodes],
+        sigma_slew=np.hypot(
+            _sigma(measured.sigma_right, shape[0], measured.local_right, rows, bool(name))[nodes],
+            _misplaced(measured, y - aim, step),
+        ),
+        sigma_lift=np.hypot(
+            _sigma(measured.sigma_up, shape[1], measured.local_up, rows, not free_level)[nodes],
+            _misplaced(measured, lift, step),
+        ),
         spread=spread,
         bears=bears,
         measured=measured,
@@ -388,6 +394,12 @@ def _sigma(place: float, shape: float, local: FloatArray | None, rows: NDArray[n
     return np.asarray((place if absolute or not math.isfinite(shape) else shape) * relative * np.ones(len(rows)))
 
 
+def _misplaced(measured: MeasuredAxis, taken: FloatArray, step: float) -> float:
+    """What an error of place along the track makes of corrections: root mean square slope of what they take out, times the error, m."""
+    slope = np.diff(taken) / step
+    return float(np.sqrt(np.mean(slope**2))) * measured.sigma_along if np.isfinite(slope).all() else math.nan
+
+
 def _ramped(
     what: str,
     ramp: float | None,
@@ -402,7 +414,7 @@ def _ramped(
 ) -> FloatArray:
     """Corrections that begin and fade out as gently as they can; a ramp that was asked for is kept."""
     if ramp is not None:
-        return _corrected(measured, deviation, target, step, replace(bounds, ramp=ramp), fixed, start)
+        return _corrected(what, measured, deviation, target, step, replace(bounds, ramp=ramp), fixed, start)
     for gentle in RAMPS:
         try:
             out = corrections(deviation, target, step, replace(bounds, ramp=gentle), fixed=fixed, start=start)
@@ -414,10 +426,11 @@ def _ramped(
                 "change of curvature there"
             )
         return out
-    return _corrected(measured, deviation, target, step, bounds, fixed, start)
+    return _corrected(what, measured, deviation, target, step, bounds, fixed, start)
 
 
 def _corrected(
+    what: str,
     measured: MeasuredAxis,
     deviation: FloatArray,
     target: FloatArray,
@@ -431,7 +444,7 @@ def _corrected(
         return corrections(deviation, target, step, bounds, fixed=fixed, start=start)
     except InfeasibleError as error:
         if measured.sigma_right <= USABLE:
-            raise
+            raise InfeasibleError(f"{what}: {error}") from error
         known = f"to {measured.sigma_right:.2f} m" if math.isfinite(measured.sigma_right) else "with no stated accuracy"
         wide = bounds.most >= WIDE.most_slew and bounds.third_difference >= WIDE.curvature_rate
         instead = (
@@ -440,7 +453,7 @@ def _corrected(
             else "slews of a metre, a curvature rate of 1e-4 1/m^2 and a cut-off of 500 m show the method on such data"
         )
         raise InfeasibleError(
-            f"{error}; note that the axis is only known {known}, too coarse for lining; {instead}"
+            f"{what}: {error}; note that the axis is only known {known}, too coarse for lining; {instead}"
         ) from error
 
 

@@ -125,6 +125,8 @@ class MeasuredAxis:
         Standard deviation place by place, where runs or the model's knots differ along the section, m; NaN where nothing was measured.
     noise_right, noise_up : tuple of AxisNoise
         Of each run, for `shape_sigma`.
+    sigma_along : float
+        Standard deviation of the place along the track that values stand at, m; 0 where they are the model's own.
     """
 
     section: Section
@@ -142,6 +144,7 @@ class MeasuredAxis:
     local_up: FloatArray | None = None
     noise_right: tuple[AxisNoise, ...] = ()
     noise_up: tuple[AxisNoise, ...] = ()
+    sigma_along: float = 0.0
 
 
 def stretch_of(measured: MeasuredAxis, start: float, finish: float, *, by_chainage: bool = False) -> MeasuredAxis:
@@ -282,6 +285,7 @@ def measured_axis(section: Section, recordings: Sequence[Recording], *, step: fl
         local_up,
         noise_right,
         noise_up,
+        math.hypot(*(one.share * recording.passage.sigma for one, recording in zip(noise_right, used, strict=True))),
     )
 
 

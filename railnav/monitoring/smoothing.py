@@ -278,6 +278,12 @@ def feasible(y: FloatArray, low: FloatArray, high: FloatArray, jump: float | Flo
     return bool(answer.status == 0)
 
 
+def _unramped(bounds: Bounds, n: int) -> tuple[FloatArray, FloatArray]:
+    """Least and most correction without the ramps: only the ends stay."""
+    inside = (np.arange(n) > 0) & (np.arange(n) < n - 1) | (not bounds.ends)
+    return np.where(inside, bounds.least, 0.0), np.where(inside, bounds.most, 0.0)
+
+
 def _why(
     y: FloatArray,
     step: float,
@@ -307,6 +313,11 @@ def _why(
                 break
         else:
             where = "over the whole section"
+        if math.isfinite(bounds.ramp) and feasible(y, *_unramped(bounds, len(y)), jump):
+            return (
+                f"corrections that begin and fade out at {1e3 * bounds.ramp:g} mm a metre at most leave a curvature rate of more than "
+                f"{bounds.third_difference:.1e} 1/m^2 {where}; allow a steeper ramp, or line farther"
+            )
         return (
             f"no correction between {1e3 * bounds.least:+.4g} and {1e3 * bounds.most:+.4g} mm leaves a curvature rate of at most "
             f"{bounds.third_difference:.1e} 1/m^2 {where}, even without fixed points; allow more of either"

@@ -168,8 +168,8 @@ def trends(geometries: Sequence[Geometry]) -> list[Trend]:
     """Growth of the standard deviation over 200 m of every banded channel that at least two dates have by the same kind of sensor.
 
     Different sensors add different noise to a standard deviation, which would show as growth: of several kinds the one with the most
-    runs counts, the latest of equals. What is significant is so among all segments of all channels: a track that did not change shows any
-    growth at all in one report of twenty or so, however many channels it has.
+    runs counts, the latest of equals. What is significant is so among all segments of all channels, so that many channels do not make many
+    findings.
 
     Parameters
     ----------

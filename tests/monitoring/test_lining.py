@@ -407,6 +407,31 @@ def test_channels_before_and_after_are_those_of_the_track_before_and_after():
     assert after == pytest.approx(expected, abs=1e-8, nan_ok=True)
 
 
+def test_what_cannot_be_is_said_of_slews_lifts_or_their_ramp():
+    rng = np.random.default_rng(11)
+    y = 0.004 * np.convolve(rng.standard_normal(2000), np.ones(30) / 6.0, mode="same")
+    with pytest.raises(InfeasibleError, match="slews: no correction between -1 and"):
+        line_up(axis(y, y), limits=LiningLimits(most_slew=0.001))
+    with pytest.raises(InfeasibleError, match=r"lifts: no correction between \+0 and \+1 mm"):
+        line_up(axis(y, y), limits=LiningLimits(most_lift=0.001))
+    with pytest.raises(
+        InfeasibleError, match=r"slews: corrections that begin and fade out at 0.001 mm a metre .* between 0 and 195 m"
+    ):
+        line_up(axis(y + 0.05), designs=(), limits=LiningLimits(ramp=1e-6))
+
+
+def test_an_error_of_place_along_the_track_widens_slews_where_the_track_is_rough():
+    rng = np.random.default_rng(12)
+    y = 0.002 * np.convolve(rng.standard_normal(3200), np.ones(12) / 4.0, mode="same")
+    known, misplaced = axis(y), replace(axis(y), sigma_along=0.05)
+    for step in (5.0, 1.0):
+        exact, wide = line_up(known, step=step), line_up(misplaced, step=step)
+        added = np.sqrt(wide.sigma_slew**2 - exact.sigma_slew**2)
+        slope = np.sqrt(np.mean(np.diff(exact.slew) ** 2)) / step
+        assert added == pytest.approx(0.05 * slope, rel=0.3)
+    assert wide.sigma_slew[0] > line_up(misplaced, step=5.0).sigma_slew[0]
+
+
 def test_limits_suit_what_the_axis_is_known_to():
     made = axis(np.zeros(400))
     assert usual_limits(made)[0].most_slew == 0.10
