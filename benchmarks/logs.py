@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 START = datetime(2025, 7, 8, tzinfo=UTC)
-#: What issue 6 asks for, units a second.
+#: What is asked for, units a second.
 LIMITS = {"nmea": 100_000, "rtklib-pos": 500_000, "ubx": 80_000, "gpx": 0}
 UNITS = {"nmea": "lines", "rtklib-pos": "rows", "ubx": "messages", "gpx": "points"}
 RATE = 10

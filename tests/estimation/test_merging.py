@@ -348,7 +348,7 @@ def test_slew_is_found_forgotten_and_learnt_anew() -> None:
 
 @pytest.mark.slow
 def test_10_mm_over_60_m_is_found_in_95_of_100_cases_false_alarms_1_in_100() -> None:
-    """Issue 3: at least 95 % of 200 seeded cases, false alarms at most 1 %; the zone is learnt anew."""
+    """At least 95 % of 200 seeded cases, false alarms at most 1 %; the zone is learnt anew."""
     truth, slewed, across = moved_axis()
     sides = np.stack([across, np.broadcast_to([0.0, 0.0, 1.0], across.shape)], axis=1)
     rng = np.random.default_rng(2026)
