@@ -29,7 +29,7 @@ WINDOW_NODES, WINDOW_LENGTH = 9, 80.0
 #: So many windows say how much more than stated surveys differ.
 FEWEST_WINDOWS = 40
 #: What is forgotten beyond each end of a moved stretch, m.
-MARGIN = 10.0
+MARGIN = 5.0
 #: Longest way without new fixes that one change test spans, m.
 LONGEST_GAP = 200.0
 #: Runs farther apart than so many sigma over half a window contradict each other.
