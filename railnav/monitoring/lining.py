@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from railnav.errors import TrackError
 from railnav.monitoring.design import Design
-from railnav.monitoring.filters import D1, D2, D3_ALIGNMENT, D3_LEVEL, band_pass, low_pass, stretches
-from railnav.monitoring.limits import FINE_ENOUGH
-from railnav.monitoring.position import MeasuredAxis, band_sigma, shape_sigma
+from railnav.monitoring.filters import low_pass, stretches
+from railnav.monitoring.improvement import borne, borne_in_words, improved, spread_of
+from railnav.monitoring.position import MeasuredAxis, shape_sigma
 from railnav.monitoring.section import Section
 from railnav.monitoring.smoothing import Bounds, FixedPoint, InfeasibleError, corrections, whittaker
 from railnav.monitoring.target import SHORTEST, level_above, target_along
@@ -305,8 +305,8 @@ def line_up(
     else:
         notes.append("no heights along the whole stretch: no lifts")
     fine_slew, fine_lift = _between(s, slew, d), _between(s, lift, d)
-    channels = _channels(deviation, fine_slew, level, fine_lift, measured.step)
-    spread = _spread(channels)
+    channels = improved(deviation, fine_slew, level, fine_lift, measured.step)
+    spread = spread_of(channels)
     lined_east, lined_north = east + fine_slew * scale * cos, north - fine_slew * scale * sin
     chord = Chord.symmetric(CHORD)
     before, after = (
@@ -318,7 +318,7 @@ def line_up(
     if len(strung):
         inside = d <= d[::every][-1]
         along = _between(d[::every], strung, d[inside])
-        strings = _spread(_channels(deviation[inside], along, np.empty(0), np.empty(0), measured.step))
+        strings = spread_of(improved(deviation[inside], along, np.empty(0), np.empty(0), measured.step))
     shape = [
         shape_sigma(noise, cutoff) if noise else relative
         for noise, relative in (
@@ -326,8 +326,8 @@ def line_up(
             (measured.noise_up, measured.relative_up),
         )
     ]
-    bears = _bears(measured, spread)
-    notes += _said(bears)
+    bears = borne(measured, spread)
+    notes += borne_in_words(bears)
     if not (measured.sigma_right <= USABLE):
         wide = (
             f"; slews of up to {limits.most_slew:g} m and a curvature rate of {limits.curvature_rate:.0e} 1/m^2 only show the method"
@@ -499,53 +499,3 @@ def _between(nodes: FloatArray, values: FloatArray, distance: FloatArray) -> Flo
     if not np.isfinite(values).all():
         return np.full(len(distance), np.nan)
     return np.asarray(PchipInterpolator(nodes, values)(np.clip(distance, nodes[0], nodes[-1])))
-
-
-def _channels(
-    right: FloatArray, slew: FloatArray, up: FloatArray, lift: FloatArray, step: float
-) -> dict[tuple[str, str], tuple[FloatArray, FloatArray]]:
-    """Alignment and longitudinal level in the bands, before and after."""
-    found: dict[tuple[str, str], tuple[FloatArray, FloatArray]] = {}
-    for name, values, change, bands in (
-        ("alignment", right, slew, (D1, D2, D3_ALIGNMENT)),
-        ("longitudinal_level", up, lift, (D1, D2, D3_LEVEL)),
-    ):
-        if not (len(values) and np.isfinite(values).all() and np.isfinite(change).all()):
-            continue
-        for band in bands:
-            if step <= band.lower / 3.0 and len(values) * step > 4.0 * band.upper:
-                found[name, band.name] = band_pass(values, step, band), band_pass(values + change, step, band)
-    return found
-
-
-def _spread(
-    channels: Mapping[tuple[str, str], tuple[FloatArray, FloatArray]],
-) -> dict[tuple[str, str], tuple[float, float]]:
-    """Standard deviations of channels, before and after."""
-    return {key: (float(np.nanstd(before)), float(np.nanstd(after))) for key, (before, after) in channels.items()}
-
-
-def _bears(
-    measured: MeasuredAxis, spread: Mapping[tuple[str, str], tuple[float, float]]
-) -> dict[tuple[str, str], tuple[float, bool]]:
-    """Sigma of the axis in each band, and whether it bears corrections there."""
-    found = {}
-    for name, bands, noise in (
-        ("alignment", (D1, D2, D3_ALIGNMENT), measured.noise_right),
-        ("longitudinal_level", (D1, D2, D3_LEVEL), measured.noise_up),
-    ):
-        for band in bands:
-            if (name, band.name) in spread:
-                sigma = band_sigma(noise, band)
-                found[name, band.name] = (sigma, sigma <= FINE_ENOUGH * spread[name, band.name][0])
-    return found
-
-
-def _said(bears: Mapping[tuple[str, str], tuple[float, bool]]) -> list[str]:
-    """Which bands the accuracy of the axis allows, in words, where it does not allow all."""
-    if not bears or all(good for _, good in bears.values()):
-        return []
-    words = {key: f"{key[0].replace('_', ' ')} {key[1]}" for key in bears}
-    allowed = ", ".join(words[key] for key, (_, good) in bears.items() if good) or "none of the bands up to 200 m"
-    wanting = ", ".join(words[key] for key, (_, good) in bears.items() if not good)
-    return [f"the accuracy of the axis allows corrections in {allowed}; in {wanting} they follow noise"]

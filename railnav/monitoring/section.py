@@ -67,6 +67,14 @@ class Section:
         names = [self.model.track_id[i] for i in (self.track[0], self.track[-1])]
         return names[0] if len(self.track) == 1 else f"{names[0]} to {names[1]}"
 
+    @property
+    def surveyed(self) -> bool:
+        """Whether the model states covariances here: it is then a survey, whose short waves are its own noise, and not a design."""
+        start = self.model.knot_start
+        return any(
+            bool(np.isfinite(self.model.covariance_g[int(start[i]) : int(start[i + 1])]).any()) for i in self.track
+        )
+
     def grid(self, step: float) -> FloatArray:
         """Uniform distances from 0 to the end, m."""
         return np.asarray(step * np.arange(int(self.length / step + 1e-9) + 1))

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from railnav.errors import OffModelError
 from railnav.monitoring.position import MeasuredAxis, measured_axis
 from railnav.monitoring.recording import record
@@ -66,7 +64,5 @@ def measured_section(
         raise OffModelError(
             f"no run covers any of section {section.name}; they cover {'; '.join(ways[:4]) or 'nothing'}"
         )
-    knots = np.concatenate([np.arange(model.knot_start[i], model.knot_start[i + 1]) for i in section.track])
-    surveyed = bool(np.isfinite(model.covariance_g[knots]).any())
     axis = measured_axis(section, recordings)
-    return replace(axis, notes=notes + axis.notes), surveyed
+    return replace(axis, notes=notes + axis.notes), section.surveyed

@@ -104,7 +104,14 @@ def good_to(plan: LiningPlan) -> str:
     """What the place of the measured axis is good to, in words."""
     across, up = plan.measured.sigma_right, plan.measured.sigma_up
     said = f"{words.length(across, 2)} across" if np.isfinite(across) else "an unknown amount across"
-    return f"{said} and {words.length(up, 2)} in height" if np.isfinite(up) else f"{said}; heights are not known"
+    if np.isfinite(up):
+        return f"{said} and {words.length(up, 2)} in height"
+    known = np.isfinite(plan.measured.up).any()
+    return (
+        f"{said} and {'an unknown amount ' if np.isfinite(across) else ''}in height"
+        if known
+        else f"{said}; heights are not known"
+    )
 
 
 def strips(plan: LiningPlan) -> Figure:
