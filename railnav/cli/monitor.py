@@ -48,6 +48,11 @@ def _default_limits(ctx: click.Context, _: click.Parameter, value: bool) -> None
 @click.option("--trends", type=PATH, help="Also write the growth of standard deviations a month: .csv or .parquet.")
 @click.option("--limits", type=PATH, help="Table of limits, .toml.  [default: standard gauge; see --default-limits]")
 @click.option(
+    "--sourced",
+    is_flag=True,
+    help="Leave out limits that were recalled, not read in their source.",
+)
+@click.option(
     "--default-limits",
     is_flag=True,
     is_eager=True,
@@ -107,6 +112,7 @@ def command(
     quality: Path | None,
     trends: Path | None,
     limits: Path | None,
+    sourced: bool,
     tracks: str | None,
     speed: float | None,
     gauge: float | None,
@@ -147,6 +153,7 @@ def command(
     from railnav.monitoring.section import section_of
 
     table = read_limits(limits) if limits else default_limits()
+    table = table.sourced() if sourced else table
     reference = _files.read_model(model)
     names = [name.strip() for name in tracks.split(",") if name.strip()] if tracks is not None else []
     section = section_of(reference, names) if tracks is not None else None

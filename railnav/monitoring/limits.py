@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,6 +120,17 @@ class LimitTable:
     def recalled(self) -> int:
         """How many entries were recalled rather than read."""
         return self.status.count("recalled")
+
+    def sourced(self) -> LimitTable:
+        """The same table without what was recalled rather than read."""
+        known = ("read", "own")
+        return replace(
+            self,
+            limits=tuple(limit for limit in self.limits if limit.status in known),
+            deviations=tuple(limit for limit in self.deviations if limit.status in known),
+            classes=tuple(limit for limit in self.classes if limit.status in known),
+            combined=self.combined if self.combined is not None and self.combined.status in known else None,
+        )
 
 
 @dataclass(frozen=True, slots=True)

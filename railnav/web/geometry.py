@@ -369,7 +369,7 @@ def _table_warning(report: Report) -> list[str]:
         total = len(report.table.status)
         lines.append(
             f"{report.table.recalled} of {total} entries of the table of limits are recalled, not read in their standard; they are marked "
-            "below. Check them, or use a table of your own (--limits), before anything hangs on them."
+            "below. Check them, use a table of your own (--limits) or leave them out (--sourced), before anything hangs on them."
         )
     return lines
 

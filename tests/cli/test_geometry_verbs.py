@@ -139,6 +139,29 @@ def test_versines_on_chords_are_given_or_refused(cars, tmp_path):
     assert "'long' is no chord" in err
 
 
+def test_recalled_limits_are_left_out_on_request(cars, tmp_path):
+    words = [
+        "monitor",
+        cars / "car-1",
+        "-m",
+        cars / "line.gpkg",
+        "-o",
+        tmp_path / "g.html",
+        "--against",
+        "model",
+        "--json",
+    ]
+    code, out, err = run(*words, "--sourced")
+    assert code == 0, err
+    facts = json.loads(out)
+    assert facts["limits_recalled"] == 0
+    part = facts["sections"][0]
+    assert {e["status"] for e in part["exceedances"]} == {"read"}
+    assert part["runs"][0]["channels"]["gauge"]["judged"]
+    assert part["runs"][0]["channels"]["alignment_left_d1"]["reason"] == "the table has no limit for it"
+    assert "are recalled" not in (tmp_path / "g.html").read_text(encoding="utf-8")
+
+
 def test_default_limits_are_printed_and_read_back(cars, tmp_path):
     code, out, _ = run("monitor", "--default-limits")
     assert code == 0
@@ -457,5 +480,6 @@ def test_a_recording_car_on_real_axes_is_monitored_and_lined(shared_data, tmp_pa
     assert facts["usable"]
     assert (facts["design"] or "") == name
     assert facts["spread_mm"]["alignment D2"][1] < 0.3 * facts["spread_mm"]["alignment D2"][0]
+    assert facts["limits"]["most_slew_mm"] == pytest.approx(100.0)
     assert facts["versine_method"]["greatest_slew_mm"] < 3.0 * facts["greatest_slew_mm"]
     assert all(band["borne"] for band in facts["bears"].values())
