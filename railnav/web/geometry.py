@@ -13,7 +13,7 @@ from railnav.monitoring.rails import axis_key, rail_key
 from railnav.web import figures, words
 from railnav.web.geometry_tables import SHOWN, ability_section, quality_section, runs_section, trend_section
 from railnav.web.page import Card, Figure, Section, Table, Warnings, page
-from railnav.web.strips import Curve, Strip, axis_of, line_map, resolution_of, stack
+from railnav.web.strips import Curve, Strip, axis_of, jumps_in_words, line_map, resolution_of, stack
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -387,7 +387,8 @@ def _strip_words(part: Monitored, moves: bool) -> str:
         else "The model was surveyed: its shape is not taken off longitudinal level and alignment, so transitions show in long waves."
     )
     more = " Dotted lines are the limits that were exceeded. Drag across the chart to zoom in: the values then shown are those each "
-    return text + (f"{more}{part.geometries[0].recording.step:g} m; a double click leads back." if moves else "")
+    text += f"{more}{part.geometries[0].recording.step:g} m; a double click leads back." if moves else ""
+    return text + jumps_in_words(part.section, part.geometries[0].distance)
 
 
 def _exceedance_section(shown: Sequence[Exceedance], total: int, places: _Places) -> Section:

@@ -46,7 +46,7 @@ def ability_section(report: Report) -> Section:
         spacing = f"{max(c.spacing for c in channels):.2f}"
         named = "all" if len(runs) == count > 1 else f"{len(runs)} runs" if len(runs) > 2 else ", ".join(runs)
         rows.append([title, named, source, reason, spacing, _sigma(worst), judged])
-    tables = [Table(columns, rows, left=4)] if rows else []
+    tables = [Table(columns, _both_rails(rows), left=4)] if rows else []
     if wanting:
         grouped: dict[str, list[str]] = {}
         for (key, reason), lacking in wanting.items():
@@ -55,6 +55,18 @@ def ability_section(report: Report) -> Section:
         lines = [[", ".join(keys), said] for said, keys in grouped.items()]
         tables.append(Table(("not given", "why"), lines, left=2))
     return Section("What these runs can bear", text, tables)
+
+
+def _both_rails(rows: list[list[str]]) -> list[list[str]]:
+    """Rows in which the left and the right rail say the same, as one."""
+    out: list[list[str]] = []
+    for row in rows:
+        left = row[0].replace(", right rail", ", left rail")
+        if left != row[0] and [left, *row[1:]] in out:
+            out[out.index([left, *row[1:]])][0] = row[0].replace(", right rail", ", each rail")
+        else:
+            out.append(row)
+    return out
 
 
 def _sigma(channel: Channel) -> str:
@@ -103,7 +115,7 @@ def quality_section(report: Report) -> Section:
     text = "Standard deviations over segments of 200 m, mm, and how many segments fall into each class. "
     combined = report.table.combined
     if combined is not None:
-        weights = ", ".join(f"{key.replace('_', ' ')} {weight:g}" for key, weight in combined.weights.items())
+        weights = ", ".join(f"{words.channel(key)} by {weight:g}" for key, weight in combined.weights.items())
         text += f"Combined weighs {weights} ({combined.status}: {combined.source})."
     return Section("Quality", text, [Table(columns, rows, left=3)] if rows else [])
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from railnav.web import figures, words
 from railnav.web.page import Card, Figure, Section, Table, Warnings, page
-from railnav.web.strips import Curve, Strip, axis_of, line_map, stack
+from railnav.web.strips import Curve, Strip, axis_of, jumps_in_words, line_map, stack
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -55,9 +55,9 @@ def lining_page(plan: LiningPlan, *, simulated: bool = False) -> str:
         lead += f" and lifts of up to {words.length(float(plan.lift.max()), 3)}"
     lead += ". "
     if plan.measured.runs:
-        lead += f"The track was measured by {words.count(len(plan.measured.runs), 'run')}, its place good to {good_to(plan)} (one sigma)."
+        lead += f"The track was measured by {words.count(len(plan.measured.runs), 'run')}, its place good (one sigma) to {good_to(plan)}."
     else:
-        lead += f"What was measured is the model's own axis, good to {good_to(plan)} (one sigma)."
+        lead += f"What was measured is the model's own axis, good (one sigma) to {good_to(plan)}."
     known = plan.sigma_slew[np.isfinite(plan.sigma_slew)]
     if len(known):
         lead += f" A slew is good to {words.length(float(np.median(known)), 2)}"
@@ -70,7 +70,8 @@ def lining_page(plan: LiningPlan, *, simulated: bool = False) -> str:
             "Along the line",
             "Right and up are positive as distance grows. Grey is before, blue after, orange what is to be moved. "
             "Diamonds are fixed points. The dotted line is the slew of the versine method. Below stand alignment and longitudinal level in "
-            "their bands, before and after. Drag across the chart to zoom in; a double click leads back.",
+            "their bands, before and after. Drag across the chart to zoom in; a double click leads back."
+            + jumps_in_words(plan.section, plan.fine.distance),
             [strips(plan)],
         ),
         _spread(plan),

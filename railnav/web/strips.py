@@ -98,6 +98,16 @@ def jumps_of(section: TrackSection, distance: FloatArray) -> list[tuple[float, f
     return [(float(distance[i + 1]), float(chainage[i]), float(chainage[i + 1])) for i in jump.tolist()]
 
 
+def jumps_in_words(section: TrackSection, distance: FloatArray) -> str:
+    """What the marks across a chart mean, where published kilometres jump; nothing where they do not."""
+    if not jumps_of(section, distance):
+        return ""
+    grey = axis_of(section, distance)[1].startswith("chainage")
+    return (
+        f" {'Grey marks kilometres that are missing' if grey else 'Dashed lines mark where published kilometres jump'}."
+    )
+
+
 def stack(
     strips: Sequence[Strip],
     *,

@@ -70,6 +70,7 @@ def test_monitor_writes_a_page_that_asks_nothing_of_the_network(cars, tmp_path):
     with found.open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert {"gauge", "longitudinal_level_left_d1", "alignment_right_d1"} <= {row["channel"] for row in rows}
+    assert "Alignment D1, each rail" in html
     assert channels.stat().st_size > 100_000
     with quality.open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))

@@ -22,7 +22,7 @@ from railnav.monitoring.monitor import Report, monitor
 from railnav.monitoring.section import section_of
 from railnav.track.model import MilePosts
 from railnav.web.geometry import geometry_page
-from railnav.web.strips import Curve, Strip, axis_of, jumps_of, pack, resolution_of, stack, unpack
+from railnav.web.strips import Curve, Strip, axis_of, jumps_in_words, jumps_of, pack, resolution_of, stack, unpack
 
 
 @pytest.fixture(scope="module")
@@ -151,6 +151,8 @@ def test_a_chart_along_kilometres_that_jump_runs_by_distance_and_marks_the_jumps
     layout = stack([Strip("s", [Curve("c", d / 1e3, d, "#000")])], identity="i", section=section, distance=d).layout
     assert any(a["text"].startswith("km 52.000 | 51.500") for a in layout["annotations"])
     assert jumps_of(section_of(line(), [TRACK]), d) == []
+    assert jumps_in_words(section, d) == " Dashed lines mark where published kilometres jump."
+    assert jumps_in_words(section_of(line(), [TRACK]), d) == ""
 
 
 def test_a_curve_breaks_where_kilometres_are_missing():
