@@ -54,17 +54,24 @@ POINT_SIZE = 11
 #: Integer marks of a hypothesis.
 COUNT, CURRENT, RECORD, VERSION, MOVED, SIGN = range(6)
 TAGS = 6
-#: Real-valued marks of a hypothesis: time the slip began (-inf: none), time since when the wheel agrees again, evidence that fades, how
-#: much of it is believed, path coordinate up to which balises are accounted for; the evidence that fades if the receiver has gone astray,
-#: its error across the track then, m, and that error's variance (negative: not known yet); the same if the run's frame is off from the
-#: start, and the odds of that, ln, which do not fade; then its ledger, what each kind of evidence has added to its log-weight.
-SLIP_SINCE, AGREE_SINCE, FADING, BELIEVED, PASSED, ASTRAY, ASTRAY_CROSS, ASTRAY_VARIANCE = range(8)
-FRAMED, FRAMED_CROSS, FRAMED_VARIANCE, FRAMED_ODDS = range(8, 12)
+#: Real-valued marks of a hypothesis: time the slip began (-inf: none), time since when the wheel agrees again, how much of the evidence
+#: of positions is believed, path coordinate up to which balises are accounted for; ln p of the fixes if the receiver has gone astray,
+#: its error across the track then, m, and that error's variance (negative: not known yet).
+SLIP_SINCE, AGREE_SINCE, BELIEVED, PASSED, ASTRAY, ASTRAY_CROSS, ASTRAY_VARIANCE = range(7)
+#: The constant part of the error across the track: ln p of the fixes if it may be anything; it and the correlated part, m, with their
+#: variances (the first negative: not known yet) and covariance; ln of how much likelier the fixes are under what is known of it,
+#: under a frame far off (a share of the former), and if the train is on a track beside that the model lacks.
+FRAMED, OFFSET_CROSS, OFFSET_VARIANCE, COLOURED, COLOURED_VARIANCE, COLOURED_OFFSET = range(7, 13)
+KNOWN_ODDS, FAULT_ODDS, MISSING_ODDS = range(13, 16)
+#: The track last looked at, the place past a turnout's curved leg not yet reached for certain (infinite: none), and once one is
+#: passed how likely a track that the model lacks still is (0: none passed).
+TURN_TRACK, TURN_PLACE, TURNED = range(16, 19)
 #: Dead reckoning by the wheel from a while ago: when it began, place, wheel distance and scale then, variances of place and scale; twice,
 #: the older one in use.
-CHECK = 12
+CHECK = 19
 CHECK_SIZE = 6
 CHECK_TIME, CHECK_PLACE, CHECK_WHEEL, CHECK_SCALE, CHECK_VARIANCE, CHECK_SCALE_VARIANCE = range(6)
+#: Then its ledger, what each kind of evidence has added to its log-weight.
 LEDGER = CHECK + 2 * CHECK_SIZE
 (
     BY_PATH,  # prior of the start and of each turnout's legs, the end of the line

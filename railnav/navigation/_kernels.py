@@ -22,7 +22,6 @@ from railnav.matching._kernels import (
     BY_POSITION,
     COUNT,
     CURRENT,
-    FADING,
     FRAMED,
     MOVED,
     P_CURVATURE,
@@ -70,6 +69,7 @@ from railnav.navigation.columns import (
     C_FRESH,
     C_FROZEN,
     C_GNSS_SPEED,
+    C_GNSS_SPEED_TIME,
     C_GYRO_FAULTS,
     C_JUMPS,
     C_LAST_EAST,
@@ -95,6 +95,8 @@ from railnav.navigation.columns import (
     C_YAW_DISTRUST,
     C_YAW_MISFIT,
     COAST_LONGEST,
+    CONTRADICTS,
+    CONTRADICTS_SHARE,
     DISTANCE,
     DISTRUST,
     DONE,
@@ -169,6 +171,7 @@ from railnav.navigation.columns import (
     STEP_MOST,
     TIME,
     TIME_TAG,
+    UNSEEN_SLIP,
     W_BEFORE,
     W_COLUMN,
     W_F,
@@ -198,7 +201,7 @@ from railnav.navigation.dynamics._kernels import (
     widen,
 )
 from railnav.navigation.integrity import _kernels as integrity
-from railnav.navigation.integrity._kernels import keep_check, stray, watch_misfit, weigh_positions
+from railnav.navigation.integrity._kernels import keep_check, note_turn, stray, watch_misfit, weigh_positions
 from railnav.navigation.measurements import _kernels as measurements
 from railnav.navigation.measurements._kernels import (
     balise_place,
@@ -215,33 +218,16 @@ from railnav.navigation.standing._kernels import depart, heaviest, hold_repeated
 
 
 @part
-def nearest_to_fix(fil, shared, bank):
-    """Slot of the hypothesis that needs the least GNSS error."""
-    i_g = fil.at[GNSS_EAST]
-    scale = shared.common[C_SCALE] * fil.settings[K_CORRELATED]
-    best = bank.live[1]
-    least = np.inf
-    for i in range(bank.live[0]):
-        x = bank.x[bank.live[1 + i]]
-        east = x[0] + scale * shared.common[C_SIGMA_EAST] * x[i_g]
-        north = x[1] + scale * shared.common[C_SIGMA_NORTH] * x[i_g + 1]
-        size = east * east + north * north
-        if size < least:
-            least = size
-            best = bank.live[1 + i]
-    return best
-
-
-@part
 def adapt(fil, shared, bank, work, time, dt):
-    """Learn the scale of the receiver's sigmas, and let the constant part's prior follow what is seen of it, exactly."""
+    """Learn the scale of the receiver's sigmas, and let the constant part's prior follow what is seen of it.
+
+    The estimate follows it; the evidence of positions rests on what was known beforehand.
+    """
     k = fil.settings
     common = shared.common
     i_g = fil.at[GNSS_EAST]
     square = 0.0
     frame = 0.0
-    base = 0.0
-    gained = 0.0
     for i in range(bank.live[0]):
         h = bank.live[1 + i]
         x, L = bank.x[h], bank.P_sqrt[h]
@@ -268,11 +254,9 @@ def adapt(fil, shared, bank, work, time, dt):
     least = min(max(stated, k[K_FRAME_LEAST]), k[K_FRAME_MOST])
     new = min(max(math.sqrt(0.5 * frame), old / 1.5, least), 1.5 * old, k[K_FRAME_MOST])
     if abs(new / old - 1.0) > 0.2:
-        near = nearest_to_fix(fil, shared, bank)
         for i in range(bank.live[0]):
             h = bank.live[1 + i]
-            work.mix[0, i] = bank.info[h, FADING]
-            work.mix[1, i] = reweigh_frame(
+            reweigh_frame(
                 bank.x[h],
                 bank.P_sqrt[h],
                 old,
@@ -282,15 +266,6 @@ def adapt(fil, shared, bank, work, time, dt):
                 work.vector[W_KEEP],
                 work.vector[W_MOVE],
             )
-            if h == near:
-                base, gained = work.mix[0, i], work.mix[1, i]
-        for i in range(bank.live[0]):
-            change = work.mix[1, i]
-            if (
-                new > old
-            ):  # at most what the narrow prior has cost: a wide one makes no track likelier than one nearer to the fixes
-                change = min(change, gained + max(base - work.mix[0, i], 0.0))
-            bank.info[bank.live[1 + i], FADING] += change
         common[C_FRAME_SIGMA] = new
 
 
@@ -403,6 +378,7 @@ def follow_all(fil, net, shared, bank, work):
             for j in range(PULLS):
                 work.slot[bank.live[1 + m], j] = work.slot[h, j]
         bank.tags[h, CURRENT] = path_index(bank, h, x[i_s], bank.tags[h, CURRENT])
+        note_turn(fil, net, shared, bank, h, work.probe)
         gone = sd > fil.settings[K_LOST_SIGMA]
         if ends != 0:
             c = bank.tags[h, COUNT] - 1 if ends > 0 else 0
@@ -490,7 +466,6 @@ def weigh_courses(bank, work):
     for i in range(bank.live[0]):
         h = bank.live[1 + i]
         said = work.slot[h, S_COURSE] - top
-        bank.info[h, FADING] += said
         bank.info[h, FRAMED] += said
         bank.info[h, BY_COURSE] += said  # the fix, let in next, credits both together
         bank.info[h, BY_POSITION] -= said
@@ -511,6 +486,12 @@ def judge_gyro(fil, shared, bank, work, time, dt, worst):
 
 
 @part
+def wheel_alone(fil):
+    """Whether a wheel carries the place between fixes with no accelerometer to tell when it slips."""
+    return fil.at[ODOMETER_SCALE] >= 0 and fil.at[ACCELEROMETER_BIAS] < 0
+
+
+@part
 def jump(fil, shared, bank, work):
     """What stepped when fixes have left every hypothesis: variances for the GNSS error (in its own units) and for the time stamps.
 
@@ -528,17 +509,22 @@ def jump(fil, shared, bank, work):
     cross = (fix[0] * tn - fix[1] * te) / size
     across = (fix[4] * tn * tn - 2.0 * fix[6] * te * tn + fix[5] * te * te) / (size * size)
     v = bank.x[best, fil.at[SPEED]]
-    if abs(v) > 3.0 and abs(along / v) <= k[K_TAG_MOST] and cross * cross < k[K_GATE] * across:
+    # a receiver whose speed is another than the wheel's has no clock to blame
+    fresh = shared.common[C_GNSS_SPEED_TIME] > shared.common[C_TIME] - 1.5
+    apart = abs(shared.common[C_GNSS_SPEED] - abs(v)) > CONTRADICTS + CONTRADICTS_SHARE * abs(v)
+    slips = fresh and apart and wheel_alone(fil)
+    if abs(v) > 3.0 and not slips and abs(along / v) <= k[K_TAG_MOST] and cross * cross < k[K_GATE] * across:
         return 0.0, (along / v) ** 2
     sigma = shared.common[C_SCALE] * k[K_CORRELATED] * shared.common[C_SIGMA_EAST]
     return max((fix[0] ** 2 + fix[1] ** 2) / (sigma * sigma), 1.0), 0.0
 
 
 @part
-def doubt_places(fil, bank, work):
+def doubt_places(fil, bank, work, odds):
     """Give every hypothesis a twin that stands where the fix shows it: not the receiver stepped, the place was wrong (17, attribution).
 
-    Later fixes tell: an error that stepped fades, a place does not. The twins stand last among the living.
+    Later fixes tell: an error that stepped fades, stamps that jumped show in proportion to the speed, a place that is wrong stays so.
+    The twins, worth `odds`, stand last among the living.
     """
     count = bank.live[0]
     if 2 * count > bank.used.shape[0]:
@@ -555,6 +541,8 @@ def doubt_places(fil, bank, work):
         size = te * te + tn * tn
         along = (fix[0] * te + fix[1] * tn) / size
         variance = (fix[4] * te * te + 2.0 * fix[6] * te * tn + fix[5] * tn * tn) / (size * size)
+        if odds < 1.0:
+            credit(bank, g, BY_PATH, math.log(odds))
         bank.x[g, fil.at[POSITION]] += along
         widen(bank.P_sqrt[g], fil.at[POSITION], math.sqrt(variance), work.vector[W_COLUMN])
         work.slot[g, S_STRETCH] += along * along + variance
@@ -618,8 +606,10 @@ def fix_all(fil, net, shared, bank, work, row):
     i_g = at[GNSS_EAST]
     keep, move, before = work.vector[W_KEEP], work.vector[W_MOVE], work.vector[W_BEFORE]
     count = bank.live[0]
-    if step > 0.0 and not timed(fil):
-        doubt_places(fil, bank, work)
+    if step > 0.0 and (wheel_alone(fil) or not timed(fil)):
+        doubt_places(fil, bank, work, 1.0)
+    elif tag > 0.0 and wheel_alone(fil):
+        doubt_places(fil, bank, work, UNSEEN_SLIP)
     for i in range(count):
         h = bank.live[1 + i]
         x, P_sqrt = bank.x[h], bank.P_sqrt[h]

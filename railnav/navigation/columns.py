@@ -61,6 +61,7 @@ K_SCALE_MOST = SETTING["scale_most"]
 K_GATE = SETTING["gate"]
 K_STEP_FIXES = SETTING["step_fixes"]
 K_LOST_AFTER = SETTING["lost_after"]
+K_TAG_SIGMA = SETTING["time_tag_sigma"]
 K_TAG_WALK = SETTING["time_tag_walk"]
 K_TAG_MOST = SETTING["time_tag_most"]
 K_SPEED_SIGMA = SETTING["speed_sigma"]
@@ -85,6 +86,8 @@ K_GNSS_FAULT = SETTING["gnss_fault"]
 K_FRAME_FAULT = SETTING["frame_fault"]
 K_ASTRAY_RATE = SETTING["astray_rate"]
 K_FRAME_FAULT_SIGMA = SETTING["frame_fault_sigma"]
+K_MISSING = SETTING["track_missing"]
+K_OFFSET_WALK = SETTING["frame_walk"]
 K_ASTRAY_WALK = SETTING["astray_walk"]
 K_ASTRAY_TIME = SETTING["astray_time"]
 K_BALISE_MISSED = SETTING["balise_missed"]
@@ -262,8 +265,14 @@ HELD = 0.6
 APART = 25.0
 #: Sigmas past a toe at which a turnout's leg may be declared.
 GUARD = 3.0
-#: Probability of a frame far off beyond which no track is declared.
-FRAME_OFF = 0.01
+#: A track that the model lacks lies this far from one that it has, m; and sigma of an error across that may be anything, m.
+BESIDE_LEAST, BESIDE_MOST, ANYWHERE = 3.5, 15.0, 30.0
+#: How likely a track that the model lacks still is once a turnout's curved leg has been run through, with a yaw gyro and without ...
+TURN_FELT, TURN_SEEN = 1e-3, 0.03
+#: ... a leg that bends by so much more than its sister, 1/m, so far past the points, m.
+LEG_BEND, LEG_PLACE = 1e-3, 20.0
+#: Squared normalised innovation at which a fix moves the error across no farther.
+CROSS_GATE = 9.0
 #: Posterior below which a hypothesis that may not have reached a toe does not keep the others from being declared past it.
 NEGLIGIBLE = 1e-3
 #: A jump of the position beyond this is no step of a GNSS error but a fault, m: the train coasts until fixes fit again ...
@@ -288,6 +297,8 @@ DEAD_WHEEL = 0.2
 REPEATED = 1e-9
 #: How much wider the law of a misled estimate's distance from the fixes is than that of a sound one's.
 FAULT_SPREAD = 10.0
+#: Odds that a jump of fixes along the track, which late stamps would explain, is a slip of the wheel that went unseen.
+UNSEEN_SLIP = 0.1
 #: How often dead reckoning by the wheel begins anew, s.
 CHECK_INTERVAL = 60.0
 #: Way over which inertial rows count once as evidence of a track, m.
@@ -329,8 +340,9 @@ W_NEW, W_H, W_F, W_KEEP, W_MOVE, W_COLUMN, W_BEFORE = range(7)
     S_ASTRAY,
     S_FRAMED,
     S_COURSE,
-) = range(15)
-SLOT_SIZE = 15
+    S_KNOWN,
+) = range(16)
+SLOT_SIZE = 16
 #: Noise columns at most.
 NOISES = 16
 

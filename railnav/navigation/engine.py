@@ -297,8 +297,9 @@ class Engine:
                 bank.info[h] = 0.0
                 bank.info[h, [paths.SLIP_SINCE, paths.AGREE_SINCE]] = -np.inf
                 bank.info[h, paths.ASTRAY] = -np.inf
-                bank.info[h, paths.FRAMED_ODDS] = -np.inf
-                bank.info[h, [paths.ASTRAY_VARIANCE, paths.FRAMED_VARIANCE]] = -1.0
+                bank.info[h, paths.MISSING_ODDS] = -np.inf
+                bank.info[h, [paths.ASTRAY_VARIANCE, paths.OFFSET_VARIANCE, paths.TURN_TRACK]] = -1.0
+                bank.info[h, paths.TURN_PLACE] = np.inf
                 bank.info[h, _CHECKS] = np.inf, -np.inf
                 bank.info[h, paths.BY_PATH] = math.log(prior)
                 bank.info[h, paths.PASSED] = local
@@ -404,8 +405,11 @@ class Engine:
             bank.tags[h, [paths.COUNT, paths.CURRENT]] = 1, 0
             bank.tags[h, [paths.RECORD, paths.VERSION]] = -1
             bank.info[h] = bank.info[best]
-            bank.info[h, [paths.FADING, paths.ASTRAY, paths.FRAMED, paths.BELIEVED]] += likelier
-            bank.info[h, [paths.ASTRAY_VARIANCE, paths.FRAMED_VARIANCE]] = -1.0
+            bank.info[h, paths.BELIEVED] += likelier
+            bank.info[h, paths.ASTRAY_VARIANCE] = -1.0
+            bank.info[h, [paths.TURN_PLACE, paths.TURNED]] = np.inf, 0.0
+            aside = here - point[[paths.P_EAST, paths.P_NORTH]]
+            bank.info[h, paths.OFFSET_CROSS] += (aside[0] * bearing[1] - aside[1] * bearing[0]) / math.hypot(*bearing)
             bank.info[h, paths.BY_PATH] += math.log(odds)
             bank.info[h, paths.PASSED] = local
             bank.info[h, _CHECKS] = np.inf, -np.inf
@@ -448,7 +452,8 @@ class Engine:
             bank.tags[h, [paths.RECORD, paths.VERSION]] = -1
             bank.info[h] = bank.info[best]
             bank.info[h, paths.BY_PATH] += math.log(0.5 * BALISE_PRIOR)
-            bank.info[h, [paths.ASTRAY_VARIANCE, paths.FRAMED_VARIANCE]] = -1.0
+            bank.info[h, [paths.ASTRAY_VARIANCE, paths.OFFSET_VARIANCE]] = -1.0
+            bank.info[h, [paths.TURN_PLACE, paths.TURNED]] = np.inf, 0.0
             bank.info[h, paths.PASSED] = local
             bank.info[h, _CHECKS] = np.inf, -np.inf
 

@@ -156,6 +156,11 @@ class Settings:
     frame_fault, frame_fault_sigma : float
         Probability that a run's frame is off by far more than is known of it (a wrong datum, an antenna elsewhere, a map moved), and
         the standard deviation of that, m. With `astray_rate` it limits what positions alone may say of tracks side by side.
+    frame_walk : float
+        How the constant part of the error across the track wanders, m/sqrt(s).
+    track_missing : float
+        Probability that a train starts on a track that the model lacks, beside one that it has. No track is declared before that is
+        unlikely.
     astray_rate, astray_walk, astray_time : float
         How often a receiver goes astray, or comes to a stretch where the track lies elsewhere than the model has it, 1/s; how its
         error across the track then wanders, m/sqrt(s), and how long that lasts on average, s.
@@ -255,8 +260,10 @@ class Settings:
     side_scale: float = 0.2
     balise_sigma: float = 0.5
     gnss_fault: float = 1e-3
-    frame_fault: float = 6e-3
-    frame_fault_sigma: float = 10.0
+    frame_fault: float = 0.015
+    frame_fault_sigma: float = 8.0
+    frame_walk: float = 0.03
+    track_missing: float = 0.1
     astray_rate: float = 1e-3
     astray_walk: float = 1.2
     astray_time: float = 20.0

@@ -7,12 +7,14 @@ import math
 import numpy as np
 import pytest
 from numba import njit
-from scipy.stats import norm
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal, norm
 
 from railnav.matching import _kernels as paths
 from railnav.navigation import columns as c
 from railnav.navigation.integrity import _kernels as integrity
 from railnav.navigation.integrity import protection_level
+from railnav.navigation.state import Settings
 
 
 @njit
@@ -34,7 +36,22 @@ def do_frame_off(info):
 
 @njit
 def do_wander(info, off, white, walk):
-    return integrity.wander(info, paths.FRAMED_CROSS, paths.FRAMED_VARIANCE, off, white, walk)
+    return integrity.wander(info, paths.ASTRAY_CROSS, paths.ASTRAY_VARIANCE, off, white, walk)
+
+
+@njit
+def do_offset(info, error, white, coloured, phi, walk):
+    return integrity.offset_row(info, error, white, coloured, phi, walk)
+
+
+@njit
+def do_odds(fil, info, known):
+    integrity.known_odds(fil, info, known)
+
+
+@njit
+def do_missing(info):
+    return integrity.track_missing(info)
 
 
 @pytest.mark.parametrize("risk", [1e-9, 1e-7, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 0.3])
@@ -58,18 +75,69 @@ def test_sigmas_that_lie_are_seen_by_their_innovations(truth, low, high):
     assert low <= np.mean(factors[40:]) < high
 
 
-def test_the_odds_of_a_frame_that_is_off():
+def settings(**changes):
+    """A filter of which the kernels read the settings only."""
+    at = np.full(17, -1, np.int64)
+    return c.Filter(at, Settings(**changes).packed(), np.zeros(3), np.zeros(3), 0)
+
+
+def seen(errors, *, white=0.5, coloured=1.0, phi=0.98, walk=0.0):
+    """Marks of a hypothesis after fixes with these errors across."""
     info = np.zeros(paths.INFO)
-    info[[paths.FADING, paths.ASTRAY, paths.FRAMED_ODDS]] = 0.0, -np.inf, math.log(0.01)
-    assert do_frame_off(info) == pytest.approx(0.01 / 1.01)
-    info[paths.ASTRAY] = 0.0
-    assert do_frame_off(info) == pytest.approx(0.01 / 2.01)
+    info[[paths.ASTRAY, paths.OFFSET_VARIANCE]] = -np.inf, -1.0
+    total = 0.0
+    for error in errors:
+        nis, spread = do_offset(info, error, white, coloured, phi, walk)
+        total += -0.5 * (nis + math.log(2.0 * math.pi * spread))
+    return info, total
+
+
+def exact(errors, prior, *, white=0.5, coloured=1.0, phi=0.98):
+    """ln p of errors = constant + first-order Gauss-Markov + white noise, by the covariance of all of them at once."""
+    m = len(errors)
+    lags = np.abs(np.subtract.outer(np.arange(m), np.arange(m)))
+    return multivariate_normal(np.zeros(m), prior + coloured * phi**lags + white * np.eye(m)).logpdf(errors)
+
+
+def test_what_is_known_of_a_constant_error_is_weighed_after_the_fact_as_exactly_as_beforehand():
+    """A wide prior, exchanged for a narrow one or a mixture, against the joint law of all fixes under these."""
+    errors = 2.0 + 0.4 * np.random.default_rng(3).standard_normal(40)
+    info, total = seen(errors)
+    assert total == pytest.approx(exact(errors, c.ANYWHERE**2), abs=1e-6)
+    do_odds(settings(frame_fault=0.1, frame_fault_sigma=7.0), info, 0.3)
+    sound, fault = exact(errors, 0.3) + math.log(0.9), exact(errors, 49.3) + math.log(0.1)
+    assert total + info[paths.KNOWN_ODDS] == pytest.approx(np.logaddexp(sound, fault), abs=1e-6)
+    assert total + info[paths.FAULT_ODDS] == pytest.approx(fault, abs=1e-6)
+    assert do_frame_off(info) == pytest.approx(math.exp(fault - np.logaddexp(sound, fault)), rel=1e-6)
+
+
+def test_a_track_that_the_model_lacks_is_as_probable_as_the_joint_law_has_it():
+    errors = 4.5 + 0.4 * np.random.default_rng(4).standard_normal(60)
+    info, total = seen(errors)
+    do_odds(settings(frame_fault=0.0, track_missing=0.05), info, 0.2)
+    beside = np.linspace(c.BESIDE_LEAST, c.BESIDE_MOST, 2001)
+    law = [exact(errors - side * d, 0.2) for side in (-1.0, 1.0) for d in beside]
+    elsewhere = math.log(0.05) + logsumexp(law) - math.log(len(law))
+    assert total + info[paths.MISSING_ODDS] == pytest.approx(elsewhere, abs=0.01)
+    here = exact(errors, 0.2)
+    assert do_missing(info) == pytest.approx(math.exp(elsewhere - np.logaddexp(here, elsewhere)), abs=0.01)
+    assert do_missing(info) > 0.5
+
+
+def test_nothing_is_said_of_a_missing_track_before_the_first_fix_nor_where_none_is_presumed():
+    info = np.zeros(paths.INFO)
+    info[[paths.ASTRAY, paths.OFFSET_VARIANCE]] = -np.inf, -1.0
+    do_odds(settings(), info, 0.2)
+    assert do_missing(info) == do_frame_off(info) == 0.0
+    info, _ = seen([5.0] * 100)
+    do_odds(settings(track_missing=0.0), info, 0.2)
+    assert do_missing(info) == 0.0
 
 
 def test_an_error_that_may_be_anything_is_a_scalar_kalman_filter():
     """Against the textbook: ln p, then mean and variance; a negative variance starts at the first fix."""
     info = np.zeros(paths.INFO)
-    info[paths.FRAMED_VARIANCE] = 100.0
+    info[paths.ASTRAY_VARIANCE] = 100.0
     mean, variance = 0.0, 100.0
     for off in (7.5, 8.0, 6.9):
         total = variance + 0.3 + 0.5
@@ -78,7 +146,7 @@ def test_an_error_that_may_be_anything_is_a_scalar_kalman_filter():
         assert said == pytest.approx(-2.0 * norm.logpdf(off, mean, math.sqrt(total)))
         gain = (variance + 0.3) / total
         mean, variance = mean + gain * (off - mean), (1.0 - gain) * (variance + 0.3)
-        assert info[[paths.FRAMED_CROSS, paths.FRAMED_VARIANCE]] == pytest.approx([mean, variance])
-    info[paths.FRAMED_VARIANCE] = -1.0
+        assert info[[paths.ASTRAY_CROSS, paths.ASTRAY_VARIANCE]] == pytest.approx([mean, variance])
+    info[paths.ASTRAY_VARIANCE] = -1.0
     assert math.isnan(do_wander(info, 3.0, 0.5, 0.3)[0])
-    assert info[[paths.FRAMED_CROSS, paths.FRAMED_VARIANCE]] == pytest.approx([3.0, 0.5])
+    assert info[[paths.ASTRAY_CROSS, paths.ASTRAY_VARIANCE]] == pytest.approx([3.0, 0.5])

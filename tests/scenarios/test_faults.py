@@ -22,7 +22,7 @@ from railnav.simulation import (
 from railnav.simulation.faults import Fault
 
 #: Faults that the navigator does not master yet; `docs/accuracy.md` says so.
-NOT_YET = {"imu-late-0.2s", "model-9m-south", "track-missing"}
+NOT_YET: set[str] = set()
 
 ONSET = 130.0
 SEEDS = (3, 4)

@@ -35,7 +35,6 @@ from railnav.navigation.columns import (
     COASTING,
     DIRECTION_CONFIDENCE,
     FORCE,
-    FRAME_OFF,
     GUARD,
     INITIALISING,
     J_DECISION,
@@ -77,10 +76,10 @@ from railnav.navigation.columns import (
 )
 from railnav.navigation.dynamics._kernels import variance_of
 from railnav.navigation.integrity._kernels import (
-    frame_off,
     mixture_bound,
     residual_bound,
     separation_bound,
+    track_missing,
     understated,
 )
 from railnav.navigation.measurements._kernels import gravity_pull
@@ -245,9 +244,9 @@ def put_out(fil, net, shared, bank, work, row, out):
     aged = row[TIME] - common[C_FIX_TIME] > k[K_COASTING]
     # fixes come, but have jumped: whether the receiver or the place was wrong is open
     jumped = not aged and variance > APART * APART and at[ACCELERATION] >= 0 and at[WHEEL_DISTANCE] < 0
-    # where only a frame far off explains the fixes, the train may as well be on a track that the model lacks
-    elsewhere = frame_off(bank.info[h]) > FRAME_OFF
-    if probability < k[K_CONFIDENCE] or jumped or elsewhere or at_a_toe(fil, shared.weight, bank, h):
+    # the posterior is that of the model's tracks; what is declared must be likely enough even so if the model lacks one
+    known = probability * (1.0 - track_missing(bank.info[h]))
+    if known < k[K_CONFIDENCE] or jumped or at_a_toe(fil, shared.weight, bank, h):
         out[OUT_MODE] = AMBIGUOUS
     elif aged:
         out[OUT_MODE] = COASTING
