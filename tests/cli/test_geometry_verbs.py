@@ -178,8 +178,14 @@ def test_default_limits_are_printed_and_read_back(cars, tmp_path):
 
 
 def test_lining_writes_a_plan_and_a_page(cars, tmp_path):
+    from dataclasses import replace
+
+    # a model that does not say it is simulated: the page must know it from the runs
+    replace(line(), provenance={}).to_file(tmp_path / "line.gpkg")
     plan, page = tmp_path / "plan.csv", tmp_path / "plan.html"
-    code, out, _ = run("lining", cars / "car-1", cars / "car-2", "-m", cars / "line.gpkg", "-o", plan, "--report", page)
+    code, out, _ = run(
+        "lining", cars / "car-1", cars / "car-2", "-m", tmp_path / "line.gpkg", "-o", plan, "--report", page
+    )
     assert code == 0
     assert "smoothed" in out
     with plan.open(encoding="utf-8") as file:
