@@ -30,8 +30,8 @@ _POINTS = 12
 _EXACT = 0.25
 #: Where transitions hardly show, two that meet in a peak of curvature are an arc, and that weighs so much, in -2 log likelihood.
 _PEAK = 20.0
-#: Rounds of changes.
-_ROUNDS = 6
+#: Rounds of changes; under a known noise the first ones find them.
+_ROUNDS, _ROUNDS_KNOWN = 6, 3
 #: A whole adjustment may come out dearer than its parts promised by this.
 _SLACK = 30.0
 
@@ -204,7 +204,7 @@ def spread(fit: PlanFit, points: Points) -> float:
 
 def refined(fit: PlanFit, points: Points, *, jump: float = 0.0) -> PlanFit:
     """The fit with elements left out, joined, made plain or smooth, for as long as that pays; `jump` as in `simplifications`."""
-    for _ in range(_ROUNDS):
+    for _ in range(_ROUNDS_KNOWN if points.known else _ROUNDS):
         count = len(fit.chain.kind)
         before = fit
         length_sigma, bend_sigma, _ = plan_sigmas(fit)

@@ -189,11 +189,7 @@ def fit_design(
     whole = fit
     fit = _one_sided(_without_stubs(fit, points), points)
     if known:  # cutting leaves pieces that the points do not speak for
-        for _ in range(3):
-            before = len(fit.chain.kind)
-            fit = _one_sided(refined(fit, points, jump=jump), points)
-            if len(fit.chain.kind) == before:
-                break
+        fit = _one_sided(refined(fit, points, jump=jump), points)
     if len(fit.chain.kind) != len(whole.chain.kind):
         owed = owed_to_law(fit, law)
     tell(label, 3, total)
@@ -466,7 +462,7 @@ def _doubts(
     if total > 0.05:
         said.append(
             f"track {axis.track}: noise of {total:.2f} m across the track shows curves longer than about {shortest:.0f} m; "
-            "shorter elements, and where transitions begin, are not in these points; a straight that meets an arc stands for the middle of a "
-            "transition which they hide"
+            "shorter elements, and where transitions begin, are not in these points; a hidden transition may have its middle "
+            "where a straight meets an arc"
         )
     return said

@@ -26,8 +26,10 @@ FloatArray = NDArray[np.float64]
 _WAVES = np.geomspace(1e-5, 1e4, 800)
 #: Waves of fixes reach over this at least, in lengths of smoothing: shorter ones count as white.
 _LONG = 5.0
-#: And at most so far, m: longer ones bend nothing.
-_LONGEST = 20_000.0
+#: Waves smaller than this share of the white noise are none.
+_SLIGHT = 0.05
+#: And at most so far, m: fixes of trains err alike over minutes.
+_LONGEST = 5_000.0
 #: A transition shows where it is worth this, in -2 log likelihood; none is taken to be longer than that unseen, m.
 _SHOWN, _LONGEST_UNSEEN = 16.0, 150.0
 #: Where transitions shorter than this are hidden, they are not expected to show, m.
@@ -118,12 +120,12 @@ def noise_of_smoothed(walk: float, offset: float, slope: float, curvature: float
             low = share
     white = told(r, c)[2]
     waves = max(offset**2 - white, 0.0)
-    length = 2.0 * waves / c if c > 0.0 else 0.0
     smoothing = float((max(r + c * L**2, 1e-30) / q) ** (1.0 / 6.0))
-    if c <= 0.0 or length < _LONG * smoothing:
+    if waves < _SLIGHT**2 * r / smoothing:
         return SurveyNoise(smoothing, r + c * smoothing**2, 0.0, 1.0)
-    if length > _LONGEST:
-        length, waves = _LONGEST, 0.5 * c * _LONGEST
+    length = min(2.0 * waves / max(c, 1e-30), _LONGEST)  # chains that were merged forget that their runs erred alike
+    if length < _LONG * smoothing:
+        return SurveyNoise(smoothing, r + c * smoothing**2, 0.0, 1.0)
     return SurveyNoise(smoothing, r, float(np.sqrt(waves)), length)
 
 
