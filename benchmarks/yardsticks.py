@@ -4,8 +4,10 @@
 
 A fictitious line of sixteen stations of four tracks, 96 crossovers and loops, run over from end to end on random lawful ways: at every
 facing turnout one leg in so many. Each case is judged forward, as on board, at the fixes: epochs and turnouts right, what is declared,
-moves that no train can make, errors along the track and whether they lie inside a 95 % bound. Then gaps of 300 s, and trains that stop and
-come back inside one. Beside them the track nearest to each fix. Everything here is simulated.
+moves that no train can make, errors along the track and whether they lie inside a 95 % bound. "Told" runs declare the receiver's white and
+coloured parts in run.toml, as the peers are told them; the others state one sigma a fix and no more. A receiver alone is also judged
+smoothed, after the fact. Then gaps of 300 s, and trains that stop and come back inside one. Beside them the track nearest to each fix.
+Everything here is simulated.
 """
 
 from __future__ import annotations
@@ -55,7 +57,10 @@ CASES: dict[str, Outfit] = {
     "GNSS + IMU": Outfit("imu", gnss=RECEIVER, imu=INERTIAL),
     "GNSS + odometer": Outfit("odometer", gnss=RECEIVER, odometer=WHEEL),
     "GNSS alone": Outfit("gnss", gnss=RECEIVER),
+    "GNSS alone, told": Outfit("gnss", gnss=RECEIVER),
+    "GNSS alone, told, smoothed": Outfit("gnss", gnss=RECEIVER),
     "GNSS positions alone": Outfit("positions", gnss=RECEIVER),
+    "GNSS positions alone, told": Outfit("positions", gnss=RECEIVER),
 }
 #: A turnout counts as right when the track named is right this far past its toe, m, and later until the leg ends or `LEG` metres.
 PAST, LEG = 40.0, 400.0
@@ -218,11 +223,11 @@ def nearest(line: TrackModel, run: Run) -> np.ndarray:
     return np.array([line.track_index(c[0].track) if c else -1 for c in found])
 
 
-def judge(tally: Tally, net: Network, run: Run, truth: rn.Truth, leg: Leg) -> None:
+def judge(tally: Tally, net: Network, run: Run, truth: rn.Truth, leg: Leg, *, smooth: bool = False) -> None:
     """Navigate one run and count."""
     line = net.line
     begun = time.process_time()
-    solution = rn.navigate(run, line, integrity_risk=0.05)
+    solution = rn.navigate(run, line, integrity_risk=0.05, smooth=smooth)
     tally.seconds += time.process_time() - begun
     c = compare(solution, truth, by="name")
     keep = np.isin(c.row, at_fixes(solution, run))
@@ -277,8 +282,11 @@ def on_line(net: Network, name: str, runs: int, first: int) -> dict[str, Any]:
     tally, driving = Tally(), Driving(speed=33.0)
     for seed in range(first, first + runs):
         leg = net.way(np.random.default_rng([seed, 1]))
-        run, truth = simulate(net.line, leg, seed=seed, outfit=CASES[name], driving=driving, tunnels=False)
-        judge(tally, net, stripped(run) if name == "GNSS positions alone" else run, truth, leg)
+        run, truth = simulate(
+            net.line, leg, seed=seed, outfit=CASES[name], driving=driving, tunnels=False, declare="told" in name
+        )
+        run = stripped(run) if CASES[name].name == "positions" else run
+        judge(tally, net, run, truth, leg, smooth="smoothed" in name)
     pooled = pooled_reliability(tally.parts)
     count = sum(len(a) for a in tally.along)
     print(f"{name}: {runs} runs, {tally.epochs:,} fixes, {tally.turnouts} facing turnouts")

@@ -52,8 +52,8 @@ OFFSET, EAST, NORTH, D_EAST, D_NORTH, CURVATURE, GRADIENT, CANT = range(8)
 ) = range(11)
 POINT_SIZE = 11
 #: Integer marks of a hypothesis.
-COUNT, CURRENT, RECORD, VERSION, MOVED, SIGN = range(6)
-TAGS = 6
+COUNT, CURRENT, RECORD, VERSION, MOVED, SIGN, INTO = range(7)  # INTO: slot that it was merged into
+TAGS = 7
 #: Real-valued marks of a hypothesis: time the slip began (-inf: none), time since when the wheel agrees again, how much of the evidence
 #: of positions is believed, path coordinate up to which balises are accounted for; ln p of the fixes if the receiver has gone astray,
 #: its error across the track then, m, and that error's variance (negative: not known yet).
@@ -546,5 +546,6 @@ def merge_all(bank, position, speed, threshold, column):
                 j += 1
                 continue
             merge(bank, a, b, offset, position, column)
+            bank.tags[b, INTO] = a
             drop(bank, j)
         i += 1

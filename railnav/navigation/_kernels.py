@@ -23,6 +23,7 @@ from railnav.matching._kernels import (
     COUNT,
     CURRENT,
     FRAMED,
+    INTO,
     MOVED,
     P_CURVATURE,
     P_D_EAST,
@@ -666,13 +667,24 @@ def fix_all(fil, net, shared, bank, work, row):
 
 @part
 def settle(fil, bank, shared, work):
-    """Merge what has become one, and bring every hypothesis' place up to its state."""
+    """Merge what has become one, and bring every hypothesis' place up to its state; gives how many there were before."""
+    # work.mix for the records: slot, log-weight before, share of the hypothesis that it has been merged into (0: it lives)
     i_s = fil.at[POSITION]
-    if bank.live[0] > 1:
+    before = bank.live[0]
+    if before > 1:
         for i in range(bank.live[0]):
             h = bank.live[1 + i]
             bank.tags[h, CURRENT] = path_index(bank, h, bank.x[h, i_s], bank.tags[h, CURRENT])
+            work.mix[0, i] = h
+            work.mix[1, i] = bank.logw[h]
         merge_all(bank, i_s, fil.at[SPEED], fil.settings[K_MERGE], work.vector[W_COLUMN])
+        for i in range(before):
+            h = int(work.mix[0, i])
+            into = h
+            while bank.used[into] == 0:
+                into = bank.tags[into, INTO]
+            bank.tags[h, INTO] = into
+            work.mix[2, i] = math.exp(work.mix[1, i] - bank.logw[into]) if into != h else 0.0
         normalise(bank, shared.weight, fil.settings[K_PRUNE], int(fil.settings[K_MOST]))
     for i in range(bank.live[0]):
         h = bank.live[1 + i]
@@ -680,12 +692,23 @@ def settle(fil, bank, shared, work):
         step = bank.x[h, i_s] - work.point[h, POINT_SIZE]
         work.point[h, P_EAST] += step * work.point[h, P_D_EAST]
         work.point[h, P_NORTH] += step * work.point[h, P_D_NORTH]
+    return before
 
 
 @part
-def keep_records(bank, work, records, epoch):
-    """Append one record a living hypothesis, and its window when that has changed."""
+def keep_records(bank, work, records, epoch, before):
+    """Append one record a living hypothesis, its window when that has changed, and whose pasts have been merged into it."""
     used = records.used
+    for i in range(before if before > bank.live[0] else 0):
+        h = int(work.mix[0, i])
+        into = bank.tags[h, INTO]
+        own = bank.tags[h, RECORD]
+        if into != h and bank.used[into] == 1 and own >= 0 and own != bank.tags[into, RECORD]:
+            for j in range(bank.live[0]):
+                if bank.live[1 + j] == into:
+                    join = records.joins[used[3]]
+                    join[0], join[1], join[2] = used[0] + j, own, work.mix[2, i]
+                    used[3] += 1
     n = bank.x.shape[1]
     for i in range(bank.live[0]):
         h = bank.live[1 + i]
@@ -760,9 +783,9 @@ def advance(fil, net, shared, bank, work, records, row, epoch):
     else:
         normalise(bank, shared.weight, k[K_PRUNE], most)
     common[C_FRESH] = 0.0
-    settle(fil, bank, shared, work)
+    before = settle(fil, bank, shared, work)
     if records.used[2] == 1:
-        keep_records(bank, work, records, epoch)
+        keep_records(bank, work, records, epoch, before)
 
 
 def _compiled(stamp: int) -> Any:
@@ -779,7 +802,9 @@ def _compiled(stamp: int) -> Any:
         for e in range(first, epochs.shape[0]):
             row = epochs[e]
             if records.used[2] == 1 and (
-                records.used[0] + slots > records.x.shape[0] or records.used[1] + slots > records.track.shape[0]
+                records.used[0] + slots > records.x.shape[0]
+                or records.used[1] + slots > records.track.shape[0]
+                or records.used[3] + slots > records.joins.shape[0]
             ):
                 return e, NEEDS_ROOM
             if journal.used[1] > 0 and journal.used[0] + slots > journal.lines.shape[0]:

@@ -417,4 +417,5 @@ class Records(NamedTuple):
     way: IntArray  # (versions, window)
     begin: FloatArray  # (versions, window)
     tracks: IntArray  # (versions,) how many tracks of the window count
-    used: IntArray  # (3,) records, versions, whether records are kept
+    used: IntArray  # (4,) records, versions, whether records are kept, joins
+    joins: FloatArray  # (joins, 3) record, the last one of a past merged into it, that one's share of it

@@ -582,7 +582,8 @@ def _records(n: int, records: int) -> c.Records:
         np.empty((versions, WINDOW), np.int64),
         np.empty((versions, WINDOW)),
         np.empty(versions, np.int64),
-        np.array([0, 0, int(records > 0)], np.int64),
+        np.array([0, 0, int(records > 0), 0], np.int64),
+        np.empty((versions, 3)),
     )
 
 
@@ -597,4 +598,5 @@ def _grown(records: c.Records) -> c.Records:
         _doubled(records.begin),
         _doubled(records.tracks),
         records.used,
+        _doubled(records.joins),
     )

@@ -32,7 +32,8 @@ def smooth_rows(
     """Put smoothed rows in the place of filtered ones.
 
     Each unbroken stretch of hypotheses is smoothed along the lineage of its last winner, the last stretch first. A row's track
-    probability is the weight of all final hypotheses whose past stood on the winner's track then.
+    probability is the posterior of all pasts that stood on the winner's track then: the weights of the last epoch, handed back, also to
+    the pasts of hypotheses that were merged where ways met again.
 
     Parameters
     ----------
@@ -49,7 +50,7 @@ def smooth_rows(
     -------
     (m, OUTPUT_SIZE) array
     Alternatives
-        Candidates of the rows whose track is not certain: where each final hypothesis, smoothed along its own past, has the train then.
+        Candidates of the rows whose track is not certain: where each past, smoothed for itself, has the train then.
     """
     out = out.copy()
     records, fil = engine.records, engine.filter
@@ -58,40 +59,54 @@ def smooth_rows(
     m, n = len(table), engine.states
     x, sigma = np.empty((m, n)), np.empty((m, 2))
     chain, other = np.full(m, -1, np.int64), np.full(m, -1, np.int64)
-    track, way, standing, rival = (np.empty(m, np.int64) for _ in range(4))
-    offset = np.empty(m)
+    track, way, elsewhere, way_there = (np.empty(m, np.int64) for _ in range(4))
+    offset, offset_there = np.empty(m), np.empty(m)
     told: dict[tuple[int, int, int], tuple[float, float]] = {}  # row, track, way: posterior, posterior times offset
-    elsewhere, way_there, offset_there = np.empty(m, np.int64), np.empty(m, np.int64), np.empty(m)
     x_there, sigma_there = np.empty((m, n)), np.empty((m, 2))
+    joins = records.joins[: int(records.used[3])]
+    joins[:] = joins[np.argsort(joins[:, 0], kind="stable")]
+    joined_at = joins[:, 0].astype(np.int64)
+    posterior, seen, standing = np.zeros(used), np.zeros(used, np.int8), np.empty(used, np.int64)
+    kernel.standing_of(fil, records, 0, used, standing)
     end = used
     while end > 0:
         last = int(epoch_of[end - 1])
         final = np.arange(np.searchsorted(epoch_of, last, side="left"), end)
-        weight = np.exp(records.numbers[final, c.R_LOGW])
-        weight /= weight.sum()
-        best = _winner(engine, final, weight)
-        first = int(kernel.lineage(records, int(final[best]), chain))
+        posterior[:end], seen[:end] = 0.0, 0
+        posterior[final] = np.exp(records.numbers[final, c.R_LOGW])
+        posterior[final] /= posterior[final].sum()
+        best = int(final[_winner(engine, final, posterior[final])])
+        first = int(kernel.new_lineage(records, best, seen, chain))
+        begin = int(np.searchsorted(epoch_of, first, side="left"))
+        stretch = slice(*np.searchsorted(joined_at, [begin, end]).tolist())
+        kernel.weigh(records, begin, end, stretch.stop, posterior)
         kernel.smooth_lineage(fil, records, table, chain, first, last, x, sigma)
         kernel.place(fil, engine.network.length, records, chain, first, last, x, track, way, offset)
-        kernel.tracks_of(fil, records, chain, first, last, standing)
         rows = slice(first, last + 1)
-        probability = np.zeros(last + 1 - first)
-        for w, record in zip(weight.tolist(), final.tolist(), strict=True):
-            begin = int(kernel.lineage(records, record, other))
-            kernel.tracks_of(fil, records, other, begin, last, rival)
-            begin = max(begin, first)
-            same = rival[begin : last + 1] == standing[begin : last + 1]
-            probability[begin - first :] += w * same
-            rows_apart = begin + np.flatnonzero(~same)
-            if w >= LEAST and len(rows_apart):
-                kernel.smooth_lineage(fil, records, table, other, begin, last, x_there, sigma_there)
-                kernel.place(
-                    fil, engine.network.length, records, other, begin, last, x_there, elsewhere, way_there, offset_there
-                )
-                for row in rows_apart.tolist():
-                    key = (row, int(elsewhere[row]), int(way_there[row]))
-                    before = told.get(key, (0.0, 0.0))
-                    told[key] = (before[0] + w, before[1] + w * float(offset_there[row]))
+        same = standing[begin:end] == standing[chain[epoch_of[begin:end]]]
+        probability = np.bincount(epoch_of[begin:end] - first, posterior[begin:end] * same, minlength=last + 1 - first)
+        # the others' pasts, the likeliest first: those of the end, and those that were merged into others on the way
+        ends = np.unique(np.concatenate([final, joins[stretch, 1].astype(np.int64)]))
+        ends = ends[posterior[ends] >= LEAST]
+        for record in ends[np.argsort(-posterior[ends], kind="stable")].tolist():
+            since, until = int(kernel.new_lineage(records, record, seen, other)), int(epoch_of[record])
+            since = max(since, first)
+            if since > until or chain[until] == record:
+                continue
+            span = slice(since, until + 1)
+            apart = standing[other[span]] != standing[chain[span]]
+            rows_apart = since + np.flatnonzero(apart & (posterior[other[span]] >= LEAST))
+            if not len(rows_apart):
+                continue
+            since, until = int(rows_apart[0]), int(epoch_of[record])
+            kernel.smooth_lineage(fil, records, table, other, since, until, x_there, sigma_there)
+            kernel.place(
+                fil, engine.network.length, records, other, since, until, x_there, elsewhere, way_there, offset_there
+            )
+            for row in rows_apart.tolist():
+                key, w = (row, int(elsewhere[row]), int(way_there[row])), float(posterior[other[row]])
+                before = told.get(key, (0.0, 0.0))
+                told[key] = (before[0] + w, before[1] + w * float(offset_there[row]))
         out[rows, c.OUT_TRACK] = track[rows]
         out[rows, c.OUT_WAY] = way[rows]
         out[rows, c.OUT_DIRECTION] = way[rows]
@@ -109,7 +124,7 @@ def smooth_rows(
             key, p = (row, int(track[row]), int(way[row])), float(probability[row - first])
             before = told.get(key, (0.0, 0.0))
             told[key] = (before[0] + p, before[1] + p * float(offset[row]))
-        end = int(np.searchsorted(epoch_of, first, side="left"))
+        end = begin
         if progress is not None:
             progress("smooth", m - first, m)
     if progress is not None:

@@ -36,15 +36,40 @@ from railnav.navigation.dynamics._kernels import transition, variance_of
 
 
 @njit(cache=True)
-def lineage(records, last, chain):  # record index, (m,) out by epoch: record index or -1
-    """Walk from a record to its ancestors; gives the first epoch of the lineage."""
+def new_lineage(
+    records, last, seen, chain
+):  # record index, (records,) in and out, (m,) out -> first epoch of it, or -1
+    """Walk from a record to the first ancestor that is seen already, and see them."""
     r = last
-    e = int(records.numbers[r, R_EPOCH])
-    while r >= 0:
+    e = -1
+    while r >= 0 and seen[r] == 0:
+        seen[r] = 1
         e = int(records.numbers[r, R_EPOCH])
         chain[e] = r
         r = int(records.numbers[r, R_PARENT])
     return e
+
+
+@njit(cache=True)
+def weigh(records, begin, end, joins_end, weight):  # record indices; (records,) in: the last epoch's, out: all
+    """Posterior of every record from `begin` to `end`, given the whole run: each hands its own on to the pasts that it was merged of.
+
+    `joins_end` is the number of joins before `end`; gives that before `begin`.
+    """
+    j = joins_end - 1
+    for r in range(end - 1, begin - 1, -1):
+        rest = weight[r]
+        while j >= 0 and records.joins[j, 0] > r:
+            j -= 1
+        k = j
+        while k >= 0 and records.joins[k, 0] == r:
+            part = min(records.joins[k, 2] * weight[r], rest)
+            weight[int(records.joins[k, 1])] += part
+            rest -= part
+            k -= 1
+        parent = int(records.numbers[r, R_PARENT])
+        if parent >= 0:
+            weight[parent] += rest
 
 
 @njit(cache=True)
@@ -119,14 +144,12 @@ smooth_lineage = _compiled(source_stamp(paths, columns, state, dynamics, estimat
 
 
 @njit(cache=True)
-def tracks_of(fil, records, chain, first, last, track):  # (m,) out: track by epoch
-    """Track that each filtered record of a lineage stands on."""
+def standing_of(fil, records, begin, end, track):  # (records,) out
+    """Track that each of the records from `begin` to `end` stands on."""
     i_s = fil.at[POSITION]
-    for e in range(first, last + 1):
-        r = chain[e]
+    for r in range(begin, end):
         version = int(records.numbers[r, R_VERSION])
-        i = window_index(records, version, records.x[r, i_s])
-        track[e] = records.track[version, i]
+        track[r] = records.track[version, window_index(records, version, records.x[r, i_s])]
 
 
 @njit(cache=True)
