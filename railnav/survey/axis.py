@@ -216,8 +216,9 @@ class Estimate:
 
 
 def smooth_links(step: float, noise: FloatArray, bend: FloatArray) -> Links:
-    """The curvature's random walk as rows between nodes: W (a_(k+1) - F a_k) = W (0, 0, -step of the nominal curvature).
+    """The curvature's random walk as rows between nodes: W (a_(k+1) - F a_k) = -W (h^2 / 6, h / 2, 1) (step of the nominal curvature).
 
+    The nominal curvature is linear between nodes, and what the whole one does not do the correction must: its slope and distance follow.
     W is the inverse of the lower Cholesky factor of noise^2 [[h^5/20, h^4/8, h^3/6], [., h^3/3, h^2/2], [., ., h]].
     """
     h = step
@@ -226,7 +227,7 @@ def smooth_links(step: float, noise: FloatArray, bend: FloatArray) -> Links:
     W = np.linalg.inv(np.linalg.cholesky(Q / np.outer(scale, scale))) / scale
     F = np.array([[1.0, h, 0.5 * h * h], [0.0, 1.0, h], [0.0, 0.0, 1.0]])
     weight = (1.0 / noise)[:, None, None]
-    drive = -np.diff(bend)[:, None] * W[:, 2] / noise[:, None]
+    drive = -np.diff(bend)[:, None] * (W @ np.array([h * h / 6.0, 0.5 * h, 1.0])) / noise[:, None]
     return Links(
         -(W @ F) * weight, W * weight, np.ascontiguousarray(drive[:, :, None]), np.zeros((0, 3)), np.zeros((0, 1))
     )

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from survey_simulator import PHONE, Receiver, axis_error, changed, double_line, knots
+from survey_simulator import PHONE, Receiver, axis_error, centre_line, changed, double_line, drive, knots, plane
 
 from railnav.survey import build
 from railnav.track.model import TrackModel
@@ -63,6 +63,21 @@ def test_curvature_keeps_the_clothoids(surveyed, name):
     )  # on the steepest clothoids no bias: nothing is smoothed away
     toward = np.sign(T.curvature[at][inner])
     assert abs(np.mean((error * toward)[rise])) < 4e-5
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_curvature_of_a_rough_survey_is_what_its_covariance_supports(seed):
+    """Phones, nodes 20 m apart: corrections to a nominal curve may not zigzag about it, nor turn the ends into tight curves."""
+    frame, rng = plane(), np.random.default_rng([seed, 5])
+    axis = centre_line(seed, 6.0, frame=frame)
+    model = build([drive(axis, frame, rng, run_id=f"p{p}", direction="up", day=p, receiver=PHONE) for p in range(4)])
+    k = knots(model, "up")
+    error = model.curvature[k] - axis.curvature[axis.right_of(model.easting[k], model.northing[k])[1]]
+    assert np.sqrt(np.mean(error**2)) < 3e-4  # half of what corrections at nodes alone left
+    assert np.abs(model.curvature[k]).max() < 1.25 * np.abs(axis.curvature).max()
+    assert np.abs(np.concatenate([error[:60], error[-60:]])).max() < 2.5e-3
+    bends = np.diff(model.curvature[k][::20])
+    assert np.mean(bends[1:] * bends[:-1] < 0) < 0.5  # changes of curvature follow each other, they do not alternate
 
 
 def test_heights_where_present(surveyed):

@@ -169,7 +169,8 @@ def test_angles_make_an_axis_better_and_keep_it_honest():
                 ratios.append(np.mean((error[20:-20] / sigma[20:-20]) ** 2))
         rms[gyros is not None] = np.sqrt(np.mean(errors))
     assert rms[True] < rms[False]
-    assert 0.5 < np.median(ratios) < 1.8
+    # of the mean: few independent errors in 2 km, so that single builds scatter from 0.4 to 2 and their median lies below 1
+    assert 0.6 < np.mean(ratios) < 1.5, ratios
 
 
 def test_a_ten_millimetre_slew_shows_with_angles():

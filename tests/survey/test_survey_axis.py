@@ -66,7 +66,9 @@ def dense_rows(chain):
             w = 1.0 / (e.correlated * np.sqrt(1.0 - phi[j] ** 2))
             row([(k * n + j, [-w * phi[j]]), ((k + 1) * n + j, [w])], 0.0)
         W = np.linalg.inv(np.linalg.cholesky(Q))
-        drift = np.array([0.0, 0.0, chain.bend[k] - chain.bend[k + 1]])  # the whole curvature walks, not its correction
+        # the whole curvature walks, not its correction: integrals of the nominal one, linear from node to node
+        h, fall = chain.step, chain.bend[k] - chain.bend[k + 1]
+        drift = fall * np.array([h * h / 6.0, h / 2.0, 1.0])
         for i in range(3):
             row([(k * n + K, -(W @ F)[i]), ((k + 1) * n + K, W[i])], (W @ drift)[i])
     for k in range(N):
@@ -165,8 +167,8 @@ def test_a_new_nominal_curve_changes_nothing():
     """The prior is on the whole curvature: a nominal curve that is off by a cubic gives the same axis."""
     chain = small_chain(6)
     s = np.arange(N) * STEP
-    shift = 0.4 + 3e-3 * s - 2e-5 * s**2
-    slope, bend = 3e-3 - 4e-5 * s, np.full(N, -4e-5)
+    shift = 0.4 + 3e-3 * s - 2e-5 * s**2 + 4e-7 * s**3
+    slope, bend = 3e-3 - 4e-5 * s + 1.2e-6 * s**2, -4e-5 + 2.4e-6 * s
     moved = replace(
         chain,
         value=chain.value - (shift + slope * chain.lead + 0.5 * bend * chain.lead**2),
