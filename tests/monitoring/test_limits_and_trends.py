@@ -286,6 +286,13 @@ def test_a_stretch_that_gets_worse_is_found_and_the_others_are_not():
     still = np.isfinite(level.growth.rate) & ~((level.start + 240.0 > 2300.0) & (level.start < 2640.0))
     assert level.growth.significant[still].sum() <= 1
     assert (level.growth.rate[growing] > 0).all()
+    found = trends(made)
+    together = false_discoveries(np.concatenate([t.growth.probability for t in found]), 0.05)
+    assert np.array_equal(np.concatenate([t.growth.significant for t in found]), together)
+    alone = [false_discoveries(t.growth.probability, 0.05) for t in found]
+    assert not np.array_equal(
+        np.concatenate(alone), together
+    )  # what is told of each channel by itself is another thing
     assert trends(made[:1]) == []
 
 
