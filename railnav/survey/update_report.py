@@ -178,9 +178,15 @@ def _stored_variance(side_of: Refinement, stored: AxisRecords, name: str) -> Flo
 def _words(track: str, part: dict[str, Any]) -> str:
     where = f"track {track} at offsets {part['from_m']:.0f} to {part['to_m']:.0f} m"
     ahead, back = ("to the right", "to the left") if part["coordinate"] == "across" else ("up", "down")
-    size = f"{abs(part['shift_m']) * 1e3:.0f} mm {ahead if part['shift_m'] > 0 else back} (sigma {part['sigma_m'] * 1e3:.0f} mm)"
+    size = (
+        f"{_length(abs(part['shift_m']))} {ahead if part['shift_m'] > 0 else back} (sigma {_length(part['sigma_m'])})"
+    )
     if part["verdict"] == "moved":
         return f"{where} has moved {size}: what was stored of it there is forgotten"
     if part["verdict"] == "contradiction":
         return f"{where}: the new runs contradict each other ({', '.join(part['runs'])}); none is used there, the stored axis stays"
     return f"{where}: the new runs lie {size}, farther than tracks are moved: another track; not used there"
+
+
+def _length(metres: float) -> str:
+    return f"{metres * 1e3:.0f} mm" if metres < 1.0 else f"{metres:.1f} m"

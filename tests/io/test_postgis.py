@@ -299,6 +299,36 @@ def test_survey_records_travel(server, model):
     assert set(TrackModel.read(f"{server}?model=records").records.tracks) == set(built.records.tracks)
 
 
+def test_records_of_a_line_with_a_turnout_travel_with_their_joins_and_parts(server, monkeypatch):
+    """A branch surveyed: what turnouts part into sections, and where tracks join, comes back whole, and later runs refine it."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "survey"))
+    from survey_simulator import centre_line, drive, plane
+    from test_survey_topology import diverging
+
+    frame, rng = plane(), np.random.default_rng(41)
+    axis = centre_line(3, 2.0, frame=frame)
+    ways = {"main": axis, "branch": axis.shifted(diverging(axis.arc, 0.55 * axis.arc[-1], gap=40.0))}
+    runs = [
+        drive(way, frame, rng, run_id=f"{name}-{day}", direction="up", day=day)
+        for day in range(2)
+        for name, way in ways.items()
+    ]
+    built = railnav.build(runs)
+    assert built.records is not None
+    assert built.records.joins
+    assert built.records.parts
+    built.to_file(f"{server}?model=turnout")
+    again = TrackModel.read(f"{server}?model=turnout")
+    assert again.records is not None
+    assert again.records.joins == built.records.joins
+    assert again.records.parts == built.records.parts
+    later = [drive(way, frame, rng, run_id=f"{name}-late", direction="up", day=9) for name, way in ways.items()]
+    one, two = (railnav.update(m, later) for m in (built, again))
+    assert one.track_id == two.track_id
+    for name in one.track_id:
+        assert two.length(name) == pytest.approx(one.length(name), abs=1e-6)
+
+
 def test_verbs_take_an_address(server, model, tmp_path):
     model.to_file(tmp_path / "line.gpkg")
 

@@ -436,3 +436,20 @@ def test_a_merged_axis_keeps_the_variance_it_is_told_to(known):
     least = np.where(np.arange(60) < 30, 4.0, 0.25) * plain
     kept = keep_axis(estimate, C, M, chain.noise, least=least if known else None).chain().solve().covariance[:, 0, 0]
     assert np.allclose(kept, np.maximum(least, plain) if known else plain, rtol=1e-6)
+
+
+def test_sizes_of_changes_are_told_in_millimetres_or_metres():
+    from railnav.survey.update_report import _words
+
+    part = {
+        "from_m": 10.0,
+        "to_m": 90.0,
+        "coordinate": "across",
+        "verdict": "moved",
+        "shift_m": -0.012,
+        "sigma_m": 0.0021,
+        "runs": [],
+    }
+    assert "has moved 12 mm to the left (sigma 2 mm)" in _words("up", part)
+    far = {**part, "verdict": "another track", "shift_m": 63.291, "sigma_m": 3.437}
+    assert "lie 63.3 m to the right (sigma 3.4 m), farther than tracks are moved" in _words("up", far)
