@@ -114,8 +114,8 @@ PAGES = {
             Section(
                 "protection-level",
                 "How often the protection level fails",
-                "Simulated: GNSS 1.5 m and odometer, six ways through the bundled line, fresh noise for every run.",
-                "python benchmarks/protection_level.py --epochs 60000",
+                "Simulated: GNSS 1.5 m and odometer, six ways through the bundled line, a run of its own with fresh noise for every epoch.",
+                "python benchmarks/protection_level.py --full",
             ),
             Section(
                 "faults",

@@ -2,16 +2,7 @@
 
 from railnav.simulation.bundled import demo_line
 from railnav.simulation.driving import Driving, Motion, drive
-from railnav.simulation.faults import (
-    FAULTS,
-    MODEL_FAULTS,
-    Fault,
-    model_with_fault,
-    with_fault,
-    with_shifted_model,
-    with_stale_track,
-    without_track,
-)
+from railnav.simulation.faults import FAULTS, Fault, with_fault
 from railnav.simulation.journey import Leg, Path, Stop, path_of
 from railnav.simulation.sensors import (
     IMU_SHEETS,
@@ -27,6 +18,13 @@ from railnav.simulation.sensors import (
     OdometerSensor,
     Outfit,
     outfit_of,
+)
+from railnav.simulation.stale_models import (
+    MODEL_FAULTS,
+    model_with_fault,
+    with_shifted_model,
+    with_stale_track,
+    without_track,
 )
 from railnav.simulation.train import poses, simulate
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from railnav.matching._kernels import BY_PATH, MOVED, SIGN, clone, credit, part
+from railnav.matching._kernels import BY_PATH, MOVED, SIGN, SLIP_SINCE, clone, credit, part
 from railnav.navigation.columns import (
     ACCELERATION,
     C_DISTRUST,
@@ -135,7 +135,8 @@ def stands(fil, shared, bank, row):
     if abs(bank.x[best, i_v]) > 0.5 + 3.0 * math.sqrt(variance_of(bank.P_sqrt[best], i_v)):
         return False
     spoken = common[C_GNSS_SPEED_TIME] > time - 2.5
-    if common[C_WHEEL_SEEN] > time - 1.0:
+    rolls = bank.info[best, SLIP_SINCE] == -np.inf  # a wheel that slides, or is dead, rests while the train runs
+    if rolls and common[C_WHEEL_SEEN] > time - 1.0:
         if spoken and common[C_GNSS_SPEED] > 1.0:
             return False
         return time - common[C_WHEEL_MOVED] >= rest
