@@ -286,13 +286,6 @@ def test_a_stretch_that_gets_worse_is_found_and_the_others_are_not():
     still = np.isfinite(level.growth.rate) & ~((level.start + 240.0 > 2300.0) & (level.start < 2640.0))
     assert level.growth.significant[still].sum() <= 1
     assert (level.growth.rate[growing] > 0).all()
-    found = trends(made)
-    together = false_discoveries(np.concatenate([t.growth.probability for t in found]), 0.05)
-    assert np.array_equal(np.concatenate([t.growth.significant for t in found]), together)
-    alone = [false_discoveries(t.growth.probability, 0.05) for t in found]
-    assert not np.array_equal(
-        np.concatenate(alone), together
-    )  # what is told of each channel by itself is another thing
     assert trends(made[:1]) == []
 
 
@@ -310,6 +303,15 @@ def test_what_is_significant_is_so_among_all_channels():
     assert not any(trend.growth.significant.any() for trend in _among_all([few, many]))
     sure = _among_all([made("gauge_d1", [1e-6, 0.5]), many])
     assert [trend.growth.significant.sum() for trend in sure] == [1, 0]
+
+
+def test_trends_tell_growth_over_all_channels_together():
+    found = trends([geometry(1, month=1), geometry(2, month=4, growing=0.1), geometry(3, month=7, growing=0.2)])
+    probability = [trend.growth.probability for trend in found]
+    told = np.concatenate([trend.growth.significant for trend in found])
+    assert np.array_equal(told, false_discoveries(np.concatenate(probability), 0.05))
+    by_channel = np.concatenate([false_discoveries(p, 0.05) for p in probability])
+    assert not np.array_equal(told, by_channel)  # else this test could not fail
 
 
 @pytest.mark.slow
