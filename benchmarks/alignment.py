@@ -1,6 +1,8 @@
 """Alignment fitting: simulated curves over seeds, Mannheim's axes against their element table, SBB's main line, 30 km at 1 m.
 
-Run `python benchmarks/alignment.py [--seeds N] [--tracks N]`; real axes are read from ../shared/data and left out where that is absent.
+Run `python benchmarks/alignment.py [--seeds N] [--minutes M]`; real axes are read from ../shared/data and left out where that is absent.
+Mannheim's axes are taken in a fixed random order until M minutes of CPU are used; those that earlier figures, and some of the
+prices, were looked at with are left to the end and told apart.
 Noise is added to sampled designs, so every figure is of simulated measurements of real or made-up designs.
 """
 
@@ -23,6 +25,8 @@ from railnav.monitoring.design import Design, design_of_elements
 from railnav.monitoring.fitting import axis_of_points, fit_design
 
 FloatArray = NDArray[np.float64]
+#: Axes that earlier figures were of: every n-th of all, so many.
+LOOKED_AT = 21
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
@@ -247,7 +251,7 @@ def main() -> None:
     """Print every figure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=100)
-    parser.add_argument("--tracks", type=int, default=0, help="Mannheim axes to fit; 0 for all")
+    parser.add_argument("--minutes", type=float, default=4.0, help="CPU minutes for Mannheim's axes; 0 for all of them")
     options = parser.parse_args()
     for label, given in (
         ("clothoid, white 10 mm", {}),
@@ -258,9 +262,11 @@ def main() -> None:
         got = curve(seeds, **given)
         print(f"R 600 L 80, {label}: " + ", ".join(f"{k} {_short(v)}" for k, v in got.items()), flush=True)
     line = long_line()
+    begin = time.process_time()
     got_line = joints(line, 0.010)
     assert got_line is not None
-    print(f"{line.length / 1e3:.1f} km at 1 m: {_short(got_line)}", flush=True)
+    cpu = time.process_time() - begin
+    print(f"{line.length / 1e3:.1f} km at 1 m, {cpu:.1f} CPU s: {_short(got_line)}", flush=True)
     if not DATA.is_dir():
         print("real axes: left out, no ../shared/data")
         return
@@ -269,38 +275,51 @@ def main() -> None:
         for design in sorted(designs, key=lambda d: -d.length)[:2]:
             print(f"SBB {design.track}, 5 mm: {_short(main_line(design))}", flush=True)
     designs = sorted(mannheim_designs(), key=lambda d: d.track)
-    if options.tracks:
-        designs = designs[:: max(len(designs) // options.tracks, 1)][: options.tracks]
-    rows, failed = [], []
-    for design in designs:
-        if design.length < 60.0:
-            continue
+    designs = [design for design in designs if design.length >= 60.0]
+    looked_at = designs[:: max(len(designs) // LOOKED_AT, 1)][:LOOKED_AT]
+    rest = [design for design in designs if design not in looked_at]
+    order = [rest[k] for k in np.random.default_rng(0).permutation(len(rest)).tolist()] + looked_at
+    begin, done = time.process_time(), 0
+    rows: dict[bool, list[dict[str, Any]]] = {False: [], True: []}
+    failed = []
+    for design in order:
+        if options.minutes and time.process_time() - begin > 60.0 * options.minutes:
+            break
+        done += 1
         row = joints(design)
         if row is None or "failed" in row:
             failed.append(row)
             continue
-        rows.append(row)
+        rows[done > len(rest)].append(row)
         if sys.stderr.isatty():
-            print(f"\r{len(rows)}/{len(designs)}", end="", file=sys.stderr)
-    total = {
+            print(f"\r{done}/{len(order)}", end="", file=sys.stderr)
+    print(f"Mannheim: {done} of {len(order)} axes in {time.process_time() - begin:.0f} CPU s; failed {len(failed)}")
+    for seen, label in ((False, "never looked at"), (True, "looked at before")):
+        if rows[seen]:
+            print(f"  {label}: {summary(rows[seen])}")
+    for row in sorted(rows[False] + rows[True], key=lambda row: -row["axis"])[:3]:
+        print(f"  worst axis: {_short(row)}")
+    for row in failed[:5]:
+        print(f"  {row}")
+
+
+def summary(rows: list[dict[str, Any]]) -> str:
+    """Say what fits of several axes found."""
+    total: dict[str, Any] = {
         key: sum(row[key] for row in rows)
         for key in ("length", "true", "visible", "found", "hit", "hit_visible", "sure", "sure_hit", "seconds")
     }
     miss = np.array([m for row in rows for m in row["miss"]])
     true, seen, found, hit, hit_seen = (total[key] for key in ("true", "visible", "found", "hit", "hit_visible"))
     axis = np.array([row["axis"] for row in rows])
-    print(
-        f"Mannheim, {len(rows)} axes, {total['length'] / 1e3:.1f} km, 5 mm at 1 m: joints {true}, of them {seen} that such points can "
+    return (
+        f"{len(rows)} axes, {total['length'] / 1e3:.1f} km, 5 mm at 1 m: joints {true}, of them {seen} that such points can "
         f"show; found {found}; within 2 m: {hit}; recall {hit / true:.3f} ({hit_seen / seen:.3f} of those to be seen), precision "
         f"{hit / found:.3f} "
         f"({total['sure_hit'] / total['sure']:.3f} of the {total['sure']} whose station it knows to 0.5 m); stations "
         f"rms {np.sqrt(np.mean(miss**2)):.2f} m, median {np.median(miss):.2f} m; axis rms "
-        f"{1e3 * np.sqrt(np.mean(axis**2)):.2f} mm, median {1e3 * np.median(axis):.2f} mm; {total['seconds']:.0f} s; failed {len(failed)}"
+        f"{1e3 * np.sqrt(np.mean(axis**2)):.2f} mm, median {1e3 * np.median(axis):.2f} mm"
     )
-    for row in sorted(rows, key=lambda row: -row["axis"])[:3]:
-        print(f"  worst axis: {_short(row)}")
-    for row in failed[:5]:
-        print(f"  {row}")
 
 
 def _short(value: Any) -> str:

@@ -154,7 +154,8 @@ def tried(fit: PlanFit, edits: list[Edit], points: Points) -> PlanFit:
             again = fit_plan(judgement.chain_of(made), fit.along, points.east, points.north, points.noise)
         except EstimationError:
             again = None
-        if again is not None and again.cost / factor < fit.cost / factor + fewer + _SLACK * (len(chosen) > 1):
+        met = again is not None and (again.closed or not fit.closed)
+        if met and again is not None and again.cost / factor < fit.cost / factor + fewer + _SLACK * (len(chosen) > 1):
             return again
         chosen = chosen[: len(chosen) // 2]
     return fit
@@ -179,7 +180,7 @@ def _paying(
         inner = [inner[0], *inner[1:]]
     as_is = fit_window(fit, points, part, part.items, steps=8)
     other = fit_window(fit, points, part, part.items[:head] + new + inner)
-    if as_is is None or other is None:
+    if as_is is None or other is None or (as_is.closed and not other.closed):
         return None
     gain = (as_is.cost - other.cost) / factor + PRICE * edit.fewer + edit.bonus
     if not gain > 0.0:

@@ -190,6 +190,7 @@ def fit_design(
     fit = _one_sided(_without_stubs(fit, points), points)
     if known:  # cutting leaves pieces that the points do not speak for
         fit = _one_sided(refined(fit, points, jump=jump), points)
+    fit = _without_hollow(fit, points)
     if len(fit.chain.kind) != len(whole.chain.kind):
         owed = owed_to_law(fit, law)
     tell(label, 3, total)
@@ -399,6 +400,19 @@ def _without_stubs(fit: PlanFit, points: Points) -> PlanFit:
         if again is fit:
             break
         fit = again
+    return fit
+
+
+def _without_hollow(fit: PlanFit, points: Points) -> PlanFit:
+    """The fit without transitions that bend nothing: their lengths are anything, and nothing comes to rest by them."""
+    least = 0.5 * float(np.mean(points.noise.sigma))
+    for j in reversed(judgement.hollow(judgement.items_of(fit.chain), least)):
+        fewer = judgement.without_hollow(judgement.items_of(fit.chain), j)
+        try:
+            again = fit_plan(judgement.chain_of(fewer), fit.along, points.east, points.north, points.noise)
+        except EstimationError:
+            continue
+        fit = again if again.cost < fit.cost + _GONE else fit
     return fit
 
 

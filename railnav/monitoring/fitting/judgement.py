@@ -302,6 +302,39 @@ def hardly_bent(items: list[Item]) -> list[Edit]:
     return edits
 
 
+def hollow(items: list[Item], least: float) -> list[int]:
+    """Places of transitions that move the track by less than `least` m."""
+    return [
+        j
+        for j, item in enumerate(items)
+        if item.kind >= elements.CLOTHOID
+        and item.kind != elements.VIENNESE
+        and abs(item.k1 - item.k0) * item.length**2 / 24.0 < least
+    ]
+
+
+def without_hollow(items: list[Item], j: int) -> list[Item]:
+    """The elements with transition j, which bends nothing, as part of a plain neighbour."""
+    item = items[j]
+    bend = 0.5 * (item.k0 + item.k1)
+    beside = [i for i in (j - 1, j + 1) if 0 <= i < len(items) and items[i].kind < elements.CLOTHOID]
+    if not beside:
+        kind = elements.STRAIGHT if bend == 0.0 else elements.ARC
+        return [*items[:j], replace(item, kind=kind, k0=bend, k1=bend), *items[j + 1 :]]
+    near = min(beside, key=lambda i: abs(items[i].k0 - bend))
+    long = replace(items[near], length=items[near].length + item.length)
+    if near > j:
+        return [*items[:j], replace(long, start=item.start, smooth=item.smooth), *items[j + 2 :]]
+    out = [*items[: j - 1], long]
+    rest = items[j + 1 :]
+    if rest and rest[0].kind == elements.STRAIGHT == long.kind:
+        out[-1] = replace(long, length=long.length + rest[0].length)
+        rest = rest[1:]
+    elif rest and rest[0].kind >= elements.CLOTHOID:
+        rest = [replace(rest[0], k0=long.k0, smooth=True), *rest[1:]]
+    return out + rest
+
+
 def without_leads(items: list[Item], length_sigma: FloatArray) -> list[Edit]:
     """Edits that leave out a transition which leads to, or from, an arc shorter than its sigma: the arc takes its place."""
     edits: list[Edit] = []

@@ -36,6 +36,8 @@ _AT_REST, _CLOSED = 1e-2, 1e-7
 _LEAST_LENGTH = 0.02
 #: How far elements may miss each other on the way, sigmas of the points, and the length over which a miss of direction counts, m.
 _APART, _ARM = 0.1, 20.0
+#: Elements meet if they miss each other by less than this share of the points' sigma.
+_MEETS = 0.1
 #: A length that the points do not tell is held as if it were known to this, m, a curvature to this, 1/m.
 _HARDLY_LENGTH, _HARDLY_BEND = 300.0, 0.1
 #: Damping of one holds a length to its own size and a curvature to its own, at least this, 1/m.
@@ -135,6 +137,8 @@ class PlanFit:
         Of the normal equations with their conditions.
     noise : Noise
         Of the points, as used.
+    apart : float
+        By how much elements miss each other at most, m; directions over 20 m.
     """
 
     chain: Chain
@@ -146,6 +150,12 @@ class PlanFit:
     settled: bool
     factor: Factored
     noise: Noise
+    apart: float = 0.0
+
+    @property
+    def closed(self) -> bool:
+        """Whether elements meet as far as the points could tell: what is not at rest may hide a kink between them."""
+        return self.settled or self.apart < _MEETS * float(np.median(self.noise.sigma))
 
 
 def chain_of_pieces(pieces: Pieces, along: FloatArray, ref: tuple[FloatArray, ...]) -> Chain:
@@ -280,7 +290,16 @@ def fit_plan(
     start[:, :2] += origin
     factor = factored(kkt, count_of + waves.count)
     return PlanFit(
-        replace(chain, start=start), residual, along, robust, square, float(square.sum()), settled, factor, noise
+        replace(chain, start=start),
+        residual,
+        along,
+        robust,
+        square,
+        float(square.sum()),
+        settled,
+        factor,
+        noise,
+        _apart(chain, state),
     )
 
 
