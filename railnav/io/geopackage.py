@@ -7,7 +7,6 @@ described column by column in `track_models/README.md`. The knots carry the trut
 
 from __future__ import annotations
 
-import json
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,31 +18,19 @@ from numpy.typing import NDArray
 from railnav.errors import InputError, ModelError, RailnavError
 from railnav.geodesy.grid import GridFrame
 from railnav.io.container import Container, Reader, bounds_of, create, decode_point, line_blob, opened, point_blobs
+from railnav.io.geopackage_records import CONTENT, SCHEMA_VERSION, checksum, record_source, write_records
 from railnav.io.line_references import read_references, write_references
 from railnav.io.qgis_styles import add_styles
 from railnav.io.store_address import is_store
 from railnav.track.model import KNOT_COLUMNS, End, MilePosts, NodeKind, Nodes, TrackModel
-from railnav.track.records import ROW_SIZE, AxisRecords, Borders, ModelRecords, RecordSource, TrackRecords
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-#: What `railnav_meta` calls the file's content.
-CONTENT = "reference track model"
-#: Version of the schema in track_models/README.md.
-SCHEMA_VERSION = 1
 #: Drawn lines keep within this distance of the knots, m.
 DRAWING_TOLERANCE = 0.005
 #: The knot table's BLOB columns in the order of their checksum.
 BLOB_COLUMNS = (*KNOT_COLUMNS, "covariance_g")
-
-#: The table of chain records, a row a track, and its BLOB columns in the order of their checksum.
-RECORDS = "records"
-RECORD_COLUMNS = (
-    "easting", "northing", "height", "across", "across_lean", "across_noise", "up", "up_lean", "up_noise",
-)  # fmt: skip
-#: Beside it: what is known of the frame offsets, one row for the plane and one for height.
-BORDERS = "record_borders"
 
 _KNOT_BYTES = {name: 48 if name == "covariance_g" else 8 for name in BLOB_COLUMNS}
 _ENDS = {end.name.lower(): int(end) for end in End}
@@ -101,7 +88,7 @@ def write_model(model: TrackModel, path: str | Path) -> None:
             _write_knots(container, model)
             add_styles(container, ("tracks", "nodes", "mileposts"))
             if records is not None:
-                _write_records(container, records)
+                write_records(container, records)
     except (TypeError, ValueError) as error:
         raise ModelError(f"the provenance holds more than JSON values ({error})", file=path) from error
 
@@ -166,7 +153,7 @@ def read_model(path: str | Path) -> TrackModel:
                 mileposts=_read_mileposts(reader, tracks["track_id"]),
                 references=read_references(reader, tracks["track_id"]),
                 provenance=provenance,
-                record_source=_record_source(reader, path),
+                record_source=record_source(reader, path),
             )
         except InputError:
             raise
@@ -312,7 +299,7 @@ def _write_knots(container: Container, model: TrackModel) -> None:
         for i, track in enumerate(model.track_id):
             part = slice(int(model.knot_start[i]), int(model.knot_start[i + 1]))
             blobs = [_packed(getattr(model, name)[part]) for name in BLOB_COLUMNS]
-            yield (i + 1, track, part.stop - part.start, _checksum(blobs), *blobs)
+            yield (i + 1, track, part.stop - part.start, checksum(blobs), *blobs)
 
     container.add_table(
         "knots",
@@ -328,60 +315,6 @@ def _packed(values: FloatArray) -> bytes:
     values = np.ascontiguousarray(values, "<f8")
     bits = values.view("<u8")
     return (values[:1] if (bits == bits[:1]).all() else values).tobytes()
-
-
-def _checksum(blobs: list[bytes]) -> int:
-    checksum = 0
-    for blob in blobs:
-        checksum = zlib.crc32(blob, checksum)
-    return checksum
-
-
-def _write_records(container: Container, records: ModelRecords) -> None:
-    def rows() -> Iterator[tuple[Any, ...]]:
-        for fid, (track, t) in enumerate(records.tracks.items(), 1):
-            up = t.up if t.up is not None and t.height is not None else None
-            arrays = [
-                t.easting, t.northing, t.height if up else None, t.across.rows, t.across.lean, t.across.noise,
-                *((up.rows, up.lean, up.noise) if up else (None,) * 3),
-            ]  # fmt: skip
-            blobs = [b"" if a is None else np.ascontiguousarray(a, "<f8").tobytes() for a in arrays]
-            yield (fid, track, len(t.easting), float(t.step), _checksum(blobs), *blobs)
-
-    container.add_table(
-        RECORDS,
-        "track TEXT NOT NULL UNIQUE, nodes INTEGER NOT NULL, step_m DOUBLE NOT NULL, crc32 INTEGER NOT NULL, "
-        + ", ".join(f"{name} BLOB NOT NULL" for name in RECORD_COLUMNS),
-        rows(),
-        description="Square-root records of the surveys, so that later runs refine the model: little-endian float64",
-    )
-    known = [("across", records.across), *([("up", records.up)] if records.up is not None else [])]
-    container.add_table(
-        BORDERS,
-        "coordinate TEXT NOT NULL UNIQUE, who TEXT NOT NULL, crc32 INTEGER NOT NULL, rows BLOB NOT NULL, value BLOB NOT NULL",
-        [
-            (
-                fid,
-                name,
-                json.dumps({"tracks": b.tracks, "receivers": b.receivers}, ensure_ascii=False),
-                _checksum(blobs := [np.ascontiguousarray(v, "<f8").tobytes() for v in (b.rows, b.value)]),
-                *blobs,
-            )
-            for fid, (name, b) in enumerate(known, 1)
-        ],
-        description="What is known of the frame offsets of tracks and receivers",
-    )
-    container.add_table(
-        "record_facts",
-        "key TEXT NOT NULL UNIQUE, value TEXT NOT NULL",
-        [
-            (1, "receivers", json.dumps(records.receivers, allow_nan=False, ensure_ascii=False)),
-            (2, "runs", json.dumps(records.runs, allow_nan=False, ensure_ascii=False)),
-            (3, "joins", json.dumps(records.joins, allow_nan=False, ensure_ascii=False)),
-            (4, "parts", json.dumps(records.parts, allow_nan=False, ensure_ascii=False)),
-        ],
-        description="Receivers and runs behind the records, and where their tracks join: keys and JSON values",
-    )
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
@@ -548,123 +481,3 @@ def _read_knots(reader: Reader, track_id: tuple[str, ...]) -> tuple[IntArray, di
         if checksum != crc[row]:
             sizes.refuse(row, "crc32", f"the geometry of track {track_id[i]!r:.40} is damaged (checksum differs)")
     return knot_start, knots
-
-
-# --- records ----------------------------------------------------------------------------------------------------------
-
-
-def _record_source(reader: Reader, path: str | Path) -> RecordSource | None:
-    """Read the records when they are asked for; None where the file has none."""
-    if RECORDS not in reader.tables():
-        return None
-    place = Path(path).resolve()
-    stamp = _stamp(place)
-
-    def source() -> ModelRecords:
-        if _stamp(place) != stamp:
-            raise ModelError("has changed since the model was read from it", file=path, remedy="read the model again")
-        return read_records(place)
-
-    return source
-
-
-def _stamp(path: Path) -> tuple[int, int] | None:
-    try:
-        found = path.stat()
-    except OSError:
-        return None
-    return found.st_mtime_ns, found.st_size
-
-
-def read_records(path: str | Path) -> ModelRecords:
-    """Read the square-root records of the surveys behind a stored model.
-
-    Parameters
-    ----------
-    path : path
-        A GeoPackage that `write_model` wrote.
-
-    Returns
-    -------
-    ModelRecords
-
-    Raises
-    ------
-    ModelError
-        There are none, or they are damaged.
-
-    Examples
-    --------
-    >>> read_records("nowhere.gpkg")
-    Traceback (most recent call last):
-    railnav.errors.ModelError: nowhere.gpkg: does not exist; check the name
-    """
-    with opened(path, CONTENT, newest=SCHEMA_VERSION, error=ModelError) as reader:
-        tables = reader.tables()
-        if not {RECORDS, BORDERS, "record_facts"} <= tables:
-            reader.refuse(
-                "holds no survey records", remedy="build the model from its runs with this version of railnav"
-            )
-        try:
-            facts = {key: json.loads(value) for key, value in reader.select("record_facts", ("key", "value"))}
-            borders = {
-                name: _read_borders(reader, name, json.loads(who), crc, rows, value)
-                for name, who, crc, rows, value in reader.select(
-                    BORDERS, ("coordinate", "who", "crc32", "rows", "value")
-                )
-            }
-            tracks = {
-                track: _read_track_records(reader, fid, track, nodes, step, crc)
-                for track, nodes, step, crc, fid in reader.select(RECORDS, ("track", "nodes", "step_m", "crc32", "fid"))
-            }
-            return ModelRecords(
-                tracks=tracks,
-                across=borders["across"],
-                up=borders.get("up"),
-                receivers=dict(facts["receivers"]),
-                runs=tuple(facts["runs"]),
-                joins=tuple(dict(join) for join in facts.get("joins", [])),
-                parts={str(name): [str(part) for part in of] for name, of in facts.get("parts", {}).items()},
-            )
-        except InputError:
-            raise
-        except (KeyError, TypeError, ValueError, RecursionError, RailnavError) as error:
-            reader.refuse(f"its survey records are damaged ({error})", layer=RECORDS, remedy="build the model again")
-
-
-def _read_borders(reader: Reader, name: str, who: Any, crc: Any, rows: Any, value: Any) -> Borders:
-    if not (isinstance(rows, bytes) and isinstance(value, bytes)) or _checksum([rows, value]) != crc:
-        reader.refuse(f"the frame offsets {name!r:.20} are damaged (checksum differs)", layer=BORDERS)
-    size = (len(who["tracks"]) + len(who["receivers"])) * (2 if name == "across" else 1)
-    return Borders(
-        tuple(who["tracks"]),
-        tuple(who["receivers"]),
-        np.frombuffer(rows, "<f8").reshape(size, size),
-        np.frombuffer(value, "<f8").reshape(size),
-    )
-
-
-def _read_track_records(reader: Reader, fid: int, track: str, nodes: Any, step: Any, crc: Any) -> TrackRecords:
-    blobs = dict(reader.blobs(RECORDS, RECORD_COLUMNS, fid))
-    sound = all(isinstance(blob, bytes) for blob in blobs.values())
-    if not sound or type(nodes) is not int or nodes < 3 or _checksum(list(blobs.values())) != crc:
-        reader.refuse(f"the records of track {track!r:.40} are damaged (checksum differs)", layer=RECORDS)
-    N = int(nodes)
-    if not isinstance(step, float) or not 0 < step < np.inf:
-        reader.refuse(f"the nodes of track {track!r:.40} lie {step!r:.20} m apart", layer=RECORDS)
-
-    def of(name: str, *shape: int) -> FloatArray:
-        return np.frombuffer(blobs[name], "<f8").reshape(shape)
-
-    def axis(name: str, borders: int) -> AxisRecords:
-        return AxisRecords(of(name, N, ROW_SIZE), of(f"{name}_lean", N, 3, borders), of(f"{name}_noise", N - 1))
-
-    high = bool(blobs["height"])
-    return TrackRecords(
-        step=float(step),
-        easting=of("easting", N),
-        northing=of("northing", N),
-        height=of("height", N) if high else None,
-        across=axis("across", 2),
-        up=axis("up", 1) if high else None,
-    )

@@ -30,9 +30,8 @@ from railnav.io.geopackage import (
     _packed,
     _version,
     _write_meta,
-    _write_records,
-    read_records,
 )
+from railnav.io.geopackage_records import read_records, write_records
 from railnav.io.line_references import kilometre_rows, position_rows, references_of_rows
 from railnav.io.postgis_server import (
     connected,
@@ -432,7 +431,7 @@ def _packed_records(model: TrackModel, where: StoreAddress) -> bytes | None:
         path = Path(folder) / "records.gpkg"
         with create(path, model.frame.crs_wkt) as container:
             _write_meta(container, model)
-            _write_records(container, records)
+            write_records(container, records)
         if path.stat().st_size > MAX_RECORD_BYTES:
             raise ModelError(
                 f"survey records of {path.stat().st_size / 1e6:.0f} MB do not fit a field of the database",

@@ -421,7 +421,7 @@ def test_geometry_that_makes_no_track_is_refused_with_the_file(tmp_path, small_m
     offset = np.arange(12.0)[::-1]
     blobs = list(ask(path, f"SELECT {', '.join(BLOB_COLUMNS)} FROM knots WHERE fid = 1")[0])
     blobs[0] = offset.tobytes()
-    edit(path, ("UPDATE knots SET offset = ?, crc32 = ? WHERE fid = 1", blobs[0], geopackage._checksum(blobs)))
+    edit(path, ("UPDATE knots SET offset = ?, crc32 = ? WHERE fid = 1", blobs[0], geopackage.checksum(blobs)))
     assert "offsets of track '80R-01' do not grow" in refusal(path)
 
 

@@ -61,11 +61,11 @@ def test_records_hold_the_covariance_of_the_axis(stock):
 
 
 def test_records_go_through_a_file_and_are_read_when_asked_for(stock, tmp_path, monkeypatch):
-    from railnav.io import geopackage
+    from railnav.io import geopackage_records
 
     path = tmp_path / "line.gpkg"
     stock[2].to_file(path)
-    monkeypatch.setattr(geopackage, "read_records", lambda _: pytest.fail("read before asked for"))
+    monkeypatch.setattr(geopackage_records, "read_records", lambda _: pytest.fail("read before asked for"))
     model = TrackModel.read(path)
     monkeypatch.undo()
     there, here = model.records, stock[2].records
