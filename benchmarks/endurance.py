@@ -85,7 +85,8 @@ def main() -> None:
     }
     print(
         f"simulated: {rides} rides, {figures['imu_epochs']:,} IMU epochs ({options.hours:g} h at 100 Hz) with odometer and GNSS in "
-        f"{seconds:.1f} s of CPU: {figures['sensor_epochs_per_s']:,} sensor epochs/s (bar 200,000), {figures['rows_per_s']:,} rows/s\n"
+        f"{seconds:.1f} s of CPU: {figures['sensor_epochs_per_s']:,} sensor epochs/s, "
+        f"{figures['rows_per_s']:,} rows of solution/s (bar for either: 200,000)\n"
         f"greatest memory of the process after a twentieth of the way {early / 1024:.0f} MB, at the end {late / 1024:.0f} MB; "
         f"{lost} rows lost, {elsewhere} of {rows:,} on another track or none, error along {rms:.2f} m RMS on the right one"
     )

@@ -22,6 +22,9 @@ IntArray = NDArray[np.int64]
 #: Parts of a compiled loop: they cannot be called from Python, and count no references to the arrays they are lent, which halves
 #: both the time to compile and the time to run. They must not make arrays.
 part = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)
+#: The same, put into the loop where they are called, for those with one place of call or a short body: lending some forty arrays to a part
+#: that is called takes longer than most parts.
+inlined = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False, forceinline=True)
 
 
 def source_stamp(*modules: ModuleType) -> int:
@@ -66,9 +69,11 @@ KNOWN_ODDS, FAULT_ODDS, MISSING_ODDS = range(13, 16)
 #: The track last looked at, the place past a turnout's curved leg not yet reached for certain (infinite: none), and once one is
 #: passed how likely a track that the model lacks still is (0: none passed).
 TURN_TRACK, TURN_PLACE, TURNED = range(16, 19)
+#: Metres run since the slow states took their noise.
+TRAVELLED = 19
 #: Dead reckoning by the wheel from a while ago: when it began, place, wheel distance and scale then, variances of place and scale; twice,
 #: the older one in use.
-CHECK = 19
+CHECK = 20
 CHECK_SIZE = 6
 CHECK_TIME, CHECK_PLACE, CHECK_WHEEL, CHECK_SCALE, CHECK_VARIANCE, CHECK_SCALE_VARIANCE = range(6)
 #: Then its ledger, what each kind of evidence has added to its log-weight.
@@ -170,7 +175,46 @@ def track_point(net, track, way, local, out):  # m from the entering end -> out 
     out[P_CANT_RATE] = (knots[j + 1, CANT] - knots[j, CANT]) / h if over == 0.0 else 0.0
 
 
-@part
+@inlined
+def track_shape(
+    net, track, way, local, out
+):  # m from the entering end -> out (POINT_SIZE,), all but position and tangent
+    """Evaluate how a track bends, rises and leans at a distance from the end where it is entered, as `track_point` does."""
+    first = net.knot_start[track]
+    last = net.knot_start[track + 1] - 1
+    length = net.length[track]
+    s = local if way > 0 else length - local
+    knots = net.knots
+    j = first + int(s / length * (last - first))
+    if j < first:
+        j = first
+    if j > last - 1:
+        j = last - 1
+    while j > first and knots[j, OFFSET] > s:
+        j -= 1
+    while j < last - 1 and knots[j + 1, OFFSET] <= s:
+        j += 1
+    slant = 1.0 / (knots[j + 1, OFFSET] - knots[j, OFFSET])
+    u = (s - knots[j, OFFSET]) * slant
+    inside = 1.0
+    if u < 0.0:
+        u = 0.0
+        inside = 0.0
+    elif u > 1.0:
+        u = 1.0
+        inside = 0.0
+    v = 1.0 - u
+    sign = 1.0 if way > 0 else -1.0
+    out[P_CURVATURE] = sign * inside * (v * knots[j, CURVATURE] + u * knots[j + 1, CURVATURE])
+    out[P_GRADIENT] = sign * (v * knots[j, GRADIENT] + u * knots[j + 1, GRADIENT])
+    out[P_CANT] = sign * (v * knots[j, CANT] + u * knots[j + 1, CANT])
+    out[P_SIGMA_CROSS] = v * net.sigma_cross[j] + u * net.sigma_cross[j + 1]
+    out[P_SIGMA_BEND] = net.sigma_bend[j]
+    out[P_GRADIENT_RATE] = inside * (knots[j + 1, GRADIENT] - knots[j, GRADIENT]) * slant
+    out[P_CANT_RATE] = inside * (knots[j + 1, CANT] - knots[j, CANT]) * slant
+
+
+@inlined
 def path_index(bank, h, s, start):  # path coordinate, index to start from -> index of the window's track that holds it
     """Which track of a hypothesis' window holds a path coordinate; the first and last hold all that lies beyond."""
     i = start
@@ -188,6 +232,13 @@ def path_point(net, bank, h, s, out):  # path coordinate -> out (POINT_SIZE,)
     i = path_index(bank, h, s, bank.tags[h, CURRENT])
     track_point(net, bank.track[h, i], bank.way[h, i], s - bank.begin[h, i], out)
     return i
+
+
+@inlined
+def path_shape(net, bank, h, s, out):  # path coordinate -> out (POINT_SIZE,)
+    """Evaluate how a hypothesis' path bends, rises and leans at a path coordinate."""
+    i = path_index(bank, h, s, bank.tags[h, CURRENT])
+    track_shape(net, bank.track[h, i], bank.way[h, i], s - bank.begin[h, i], out)
 
 
 @njit(cache=True)
@@ -256,7 +307,7 @@ def clone(bank, h):
     return g
 
 
-@part
+@inlined
 def credit(bank, h, entry, nats):
     """Add evidence to a hypothesis' log-weight, and write it in its ledger."""
     bank.logw[h] += nats
@@ -411,7 +462,7 @@ def _rearm(net, bank, h, s, speed, margin):
                     prepend(net, bank, g, net.move_to[k])
 
 
-@part
+@inlined
 def normalise(bank, weight, floor, keep):
     """Scale log-weights so that the posterior sums to 1, drop what falls below `floor` and keep at most `keep`; weight by slot."""
     top = -np.inf
@@ -472,8 +523,9 @@ def add_column(P_sqrt, u, first):  # (n, n) lower triangular, (n,) destroyed: P 
             continue
         a = P_sqrt[j, j]
         r = math.sqrt(a * a + u[j] * u[j])
-        c = a / r
-        s = u[j] / r
+        inverse = 1.0 / r
+        c = a * inverse
+        s = u[j] * inverse
         P_sqrt[j, j] = r
         for i in range(j + 1, n):
             t = P_sqrt[i, j]

@@ -34,6 +34,7 @@ from railnav.matching._kernels import (
     P_SIGMA_CROSS,
     POINT_SIZE,
     RECORD,
+    TRAVELLED,
     VERSION,
     clone,
     credit,
@@ -41,12 +42,14 @@ from railnav.matching._kernels import (
     drop_all,
     entering_end,
     follow,
+    inlined,
     leaving_end,
     merge_all,
     normalise,
     part,
     path_index,
     path_point,
+    path_shape,
     source_stamp,
 )
 from railnav.navigation import columns, state
@@ -84,6 +87,7 @@ from railnav.navigation.columns import (
     C_SCALE_WEIGHT,
     C_SIGMA_EAST,
     C_SIGMA_NORTH,
+    C_SLOW_TIME,
     C_START_TIME,
     C_STEPS,
     C_STOOD,
@@ -106,6 +110,7 @@ from railnav.navigation.columns import (
     ESTABLISHED,
     FORCE,
     GNSS_EAST,
+    GNSS_SPEED,
     GYRO_BIAS,
     HELD,
     K_CORRELATED,
@@ -157,6 +162,7 @@ from railnav.navigation.columns import (
     S_SHAKE,
     S_SIGN,
     S_SLIP,
+    S_SLOW,
     S_STEP,
     S_STRETCH,
     S_TAG,
@@ -165,6 +171,7 @@ from railnav.navigation.columns import (
     SIGMA_EAST,
     SIGMA_FORCE,
     SIGMA_NORTH,
+    SLOW_STEP,
     SPEED,
     SPEED_LATENCY,
     START_GATE,
@@ -190,6 +197,7 @@ from railnav.navigation.decision._kernels import keep_journal, put_out
 from railnav.navigation.dynamics import _kernels as dynamics
 from railnav.navigation.dynamics._kernels import (
     absorb,
+    first_moving,
     predict,
     project,
     reweigh_frame,
@@ -218,7 +226,7 @@ from railnav.navigation.standing._kernels import depart, heaviest, hold_repeated
 # ---------------------------------------------------------------- what all hypotheses share
 
 
-@part
+@inlined
 def adapt(fil, shared, bank, work, time, dt):
     """Learn the scale of the receiver's sigmas, and let the constant part's prior follow what is seen of it.
 
@@ -273,7 +281,7 @@ def adapt(fil, shared, bank, work, time, dt):
 # ---------------------------------------------------------------- the steps of one epoch
 
 
-@part
+@inlined
 def stretch_variance(fil, point, travel):
     """Variance of what the model's length is wrong by over some metres.
 
@@ -290,11 +298,12 @@ def stretch_variance(fil, point, travel):
     return 2.0 * length * rate * rate * travel
 
 
-@part
-def predict_all(fil, net, bank, work, row, dt):
+@inlined
+def predict_all(fil, net, bank, work, row, dt, slow):
     """Carry every hypothesis to this epoch; note what the smoother must know of the step."""
     k = fil.settings
     i_s, i_v = fil.at[POSITION], fil.at[SPEED]
+    moving = first_moving(fil)
     for i in range(bank.live[0]):
         h = bank.live[1 + i]
         x = bank.x[h]
@@ -303,14 +312,20 @@ def predict_all(fil, net, bank, work, row, dt):
             slot[j] = 0.0
         if dt <= 0.0:
             continue
-        path_point(net, bank, h, x[i_s] + 0.5 * dt * x[i_v], work.probe)
+        path_shape(net, bank, h, x[i_s] + 0.5 * dt * x[i_v], work.probe)
         slot[S_PULL] = gravity_pull(k[K_GRAVITY], work.probe[P_GRADIENT])
         slot[S_SIGN] = direction(fil, bank, h)
         slot[S_TRAVEL] = abs(dt * x[i_v])
         slot[S_STRETCH] = stretch_variance(fil, work.probe, slot[S_TRAVEL])
+        slot[S_SLOW] = slow
         poor = work.probe[P_SIGMA_CROSS] / fil.map_sigma if fil.map_sigma > 0.0 else 0.0
         if poor > 1.0:  # what the model is wrong by where it is poor does not outlast that
             slot[S_TRAVEL] *= poor * poor
+        bank.info[h, TRAVELLED] += slot[S_TRAVEL]
+        slot[S_TRAVEL] = 0.0
+        if slow > 0.0:
+            slot[S_TRAVEL] = bank.info[h, TRAVELLED]
+            bank.info[h, TRAVELLED] = 0.0
         columns = transition(
             fil,
             x,
@@ -325,15 +340,17 @@ def predict_all(fil, net, bank, work, row, dt):
             0.0,
             slot[S_TRAVEL],
             slot[S_STRETCH],
+            slow,
             work.F,
             work.Q,
             work.lead,
             work.vector[W_NEW],
         )
-        predict(x, bank.P_sqrt[h], work.F, work.Q, work.lead, columns, work.vector[W_NEW])
+        begin = 0 if slow > 0.0 else moving
+        predict(x, bank.P_sqrt[h], work.F, work.Q, work.lead, columns, work.vector[W_NEW], begin)
 
 
-@part
+@inlined
 def frozen(fil, shared, bank, row):
     """Whether a fix repeats the one before to the last digit while the train moves: no news, whatever its sigma says."""
     common = shared.common
@@ -363,7 +380,7 @@ def explained(fil, net, bank, row):
     return False
 
 
-@part
+@inlined
 def follow_all(fil, net, shared, bank, work):
     """Keep every path ahead of its train: clones at facing turnouts, buffer stops, the end of the model, lost positions."""
     i_s, i_v = fil.at[POSITION], fil.at[SPEED]
@@ -404,7 +421,7 @@ def follow_all(fil, net, shared, bank, work):
             i += 1
 
 
-@part
+@inlined
 def sense_all(fil, net, shared, bank, work, row, dt):
     """Let odometer, standstill, gyro, GNSS speed and course into every hypothesis."""
     at = fil.at
@@ -458,7 +475,7 @@ def sense_all(fil, net, shared, bank, work, row, dt):
         judge_gyro(fil, shared, bank, work, row[TIME], dt, worst)
 
 
-@part
+@inlined
 def weigh_courses(bank, work):
     """Evidence of courses counts with that of positions, and not at all if the receiver is astray or the track lies elsewhere."""
     top = -np.inf
@@ -472,7 +489,7 @@ def weigh_courses(bank, work):
         bank.info[h, BY_POSITION] -= said
 
 
-@part
+@inlined
 def judge_gyro(fil, shared, bank, work, time, dt, worst):
     """Stop believing a yaw gyro whose rates fit no hypothesis; its bias may have stepped."""
     common = shared.common
@@ -549,7 +566,7 @@ def doubt_places(fil, bank, work, odds):
         work.slot[g, S_STRETCH] += along * along + variance
 
 
-@part
+@inlined
 def note_along(shared, bank, work, time):
     """Note how far ahead of the heaviest hypothesis a fix lies: a witness of wheels that slip."""
     h = heaviest(bank)
@@ -561,7 +578,7 @@ def note_along(shared, bank, work, time):
     shared.common[C_ALONG_TIME] = time
 
 
-@part
+@inlined
 def fix_all(fil, net, shared, bank, work, row):
     """Let a GNSS position into every hypothesis, or hold it as suspect when it fits none; gives whether it was let in."""
     k = fil.settings
@@ -665,7 +682,7 @@ def fix_all(fil, net, shared, bank, work, row):
     return True
 
 
-@part
+@inlined
 def settle(fil, bank, shared, work):
     """Merge what has become one, and bring every hypothesis' place up to its state; gives how many there were before."""
     # work.mix for the records: slot, log-weight before, share of the hypothesis that it has been merged into (0: it lives)
@@ -740,7 +757,7 @@ def keep_records(bank, work, records, epoch, before):
 # ---------------------------------------------------------------- the loop
 
 
-@part
+@inlined
 def advance(fil, net, shared, bank, work, records, row, epoch):
     """Take one epoch into the living hypotheses."""
     k = fil.settings
@@ -751,7 +768,12 @@ def advance(fil, net, shared, bank, work, records, row, epoch):
     common[C_TIME] = time
     if bank.live[0] == 0:
         return
-    predict_all(fil, net, bank, work, row, dt)
+    slow = time - common[C_SLOW_TIME] if not fresh else 0.0
+    if slow < SLOW_STEP and row[EAST] != row[EAST] and row[GNSS_SPEED] != row[GNSS_SPEED]:
+        slow = 0.0
+    if fresh or slow > 0.0:
+        common[C_SLOW_TIME] = time
+    predict_all(fil, net, bank, work, row, dt, slow)
     follow_all(fil, net, shared, bank, work)
     if bank.live[0] == 0:
         return

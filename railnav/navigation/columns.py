@@ -223,8 +223,11 @@ OUTPUT_SIZE = 13
     C_BLAMED_WAY,  # how far it may have carried the train astray by then, m
     C_RESCALED,  # when the receiver confirmed the speed against the wheel for long
     C_MISFIT,  # squared normalised innovation of fixes a degree of freedom, of late
-) = range(61)
-COMMON_SIZE = 61
+    C_SLOW_TIME,  # when the slow states last took their noise
+) = range(62)
+COMMON_SIZE = 62
+#: Errors of sensors take their noise at fixes, where they tell, and after so long without one, s.
+SLOW_STEP = 0.95
 #: Innovations of fixes are judged over so many; their sigmas are too small where the mean square exceeds this.
 MISFIT_FIXES, MISFIT_USUAL = 20.0, 1.4
 #: How often tracks nearby that no hypothesis holds are given a rival, s.
@@ -316,10 +319,12 @@ BEND_CHANGE = 1e-5
 BLIND_LENGTH = 200.0
 
 #: Columns of a record's numbers, kept for the smoother.
-R_EPOCH, R_PARENT, R_VERSION, R_LOGW, R_PULL, R_SLIP, R_SHAKE, R_STEP, R_TAG, R_SIGN, R_TRAVEL, R_STRETCH = range(12)
-RECORD_SIZE = 12
+R_EPOCH, R_PARENT, R_VERSION, R_LOGW, R_PULL, R_SLIP, R_SHAKE, R_STEP, R_TAG, R_SIGN, R_TRAVEL, R_STRETCH, R_SLOW = (
+    range(13)
+)
+RECORD_SIZE = 13
 #: Those of them that the filter fills as it goes: from R_PULL on.
-PULLS = 8
+PULLS = 9
 
 #: Rows of `Work.vector`.
 W_NEW, W_H, W_F, W_KEEP, W_MOVE, W_COLUMN, W_BEFORE = range(7)
@@ -333,6 +338,7 @@ W_NEW, W_H, W_F, W_KEEP, W_MOVE, W_COLUMN, W_BEFORE = range(7)
     S_SIGN,
     S_TRAVEL,
     S_STRETCH,
+    S_SLOW,
     S_NIS,
     S_SAID,
     S_MASS,
@@ -341,8 +347,8 @@ W_NEW, W_H, W_F, W_KEEP, W_MOVE, W_COLUMN, W_BEFORE = range(7)
     S_FRAMED,
     S_COURSE,
     S_KNOWN,
-) = range(16)
-SLOT_SIZE = 16
+) = range(17)
+SLOT_SIZE = 17
 #: Noise columns at most.
 NOISES = 16
 

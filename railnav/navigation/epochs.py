@@ -365,13 +365,13 @@ def _inertial_means(imu: ImuStream, time: FloatArray) -> tuple[FloatArray, ...]:
     rate = imu.gyro @ matrix[2]
     usual = float(np.median(np.diff(imu.time))) if len(imu) > 1 else IMU_STEP
     width = np.minimum(np.diff(imu.time, prepend=imu.time[0] - usual), 1.5 * usual)
-    edges = np.column_stack([imu.time - width, imu.time]).ravel()
-    edges = np.maximum.accumulate(edges)
+    # each sample counts over its own interval: what is whole before a time, and the part of the sample that it falls into
+    begin = np.append(imu.time[0] - width[0], np.maximum(imu.time[1:] - width[1:], imu.time[:-1]))
+    inside = np.minimum(np.searchsorted(imu.time, time), len(imu) - 1)
+    part = np.clip((time - begin[inside]) / np.maximum(imu.time - begin, 1e-12)[inside], 0.0, 1.0)
 
     def between(value: FloatArray) -> FloatArray:
-        total = np.cumsum(value)
-        cumulative = np.column_stack([total - value, total]).ravel()
-        at = np.interp(time, edges, cumulative)
+        at = np.cumsum(value)[inside] - (1.0 - part) * value[inside]
         return np.diff(at, prepend=NAN)
 
     covered = between(width)

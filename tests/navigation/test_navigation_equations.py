@@ -26,13 +26,13 @@ from railnav.units import RAIL_CENTRE_DISTANCE, STANDARD_GRAVITY
 
 @njit
 def do_predict(x, P_sqrt, F, Q, lead, count, new):
-    dynamics.predict(x, P_sqrt, F, Q, lead, count, new)
+    dynamics.predict(x, P_sqrt, F, Q, lead, count, new, 0)
 
 
 @njit
 def do_transition(fil, x, dt, sign, force, rough, pull, slip, shake, step, tag, travel, stretch, F, Q, lead, new):
     return dynamics.transition(
-        fil, x, dt, sign, force, rough, pull, slip, shake, step, tag, travel, stretch, F, Q, lead, new
+        fil, x, dt, sign, force, rough, pull, slip, shake, step, tag, travel, stretch, dt, F, Q, lead, new
     )
 
 

@@ -16,6 +16,7 @@ from railnav.matching._kernels import (
     P_EAST,
     P_GRADIENT,
     P_NORTH,
+    inlined,
     part,
 )
 from railnav.navigation.columns import (
@@ -85,7 +86,7 @@ from railnav.navigation.integrity._kernels import (
 from railnav.navigation.measurements._kernels import gravity_pull
 
 
-@part
+@inlined
 def lawful(bank, h, track, way):
     """Whether a hypothesis' window passes the track that was put out last: then its path leads on from there."""
     for i in range(bank.tags[h, COUNT]):
@@ -94,7 +95,7 @@ def lawful(bank, h, track, way):
     return bank.track[h, bank.tags[h, CURRENT]] == track
 
 
-@part
+@inlined
 def choose(fil, shared, bank, work):
     """Hypothesis to put out: the best on the most probable track, or -1 for one row apart when that is no lawful continuation."""
     common = shared.common
@@ -162,7 +163,7 @@ def at_a_toe(fil, weight, bank, h):
     return False
 
 
-@part
+@inlined
 def put_out(fil, net, shared, bank, work, row, out):
     """Fill one output row from the posterior: the track, where on it, its probability, the mode and the protection level."""
     k = fil.settings

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from railnav.matching._kernels import add_column, part
+from railnav.matching._kernels import add_column, inlined, part
 from railnav.navigation.columns import (
     ACCELERATION,
     ACCELEROMETER_BIAS,
@@ -43,31 +43,25 @@ from railnav.navigation.columns import (
 )
 
 
-@part
+@inlined
 def timed(fil):
     """Whether a wheel or an accelerometer tells when fixes were taken: positions and their own speeds fit any shift of their stamps."""
     return fil.at[ACCELERATION] < 0 or fil.at[ODOMETER_SCALE] >= 0
 
 
-@part
-def transition(fil, x, dt, sign, force, rough, pull, slip, shake, step, tag, travel, stretch, F, Q, lead, new):
-    """Fill the transition matrix F (lower triangular), the noise columns Q with their first rows and the predicted state (19.2).
+@inlined
+def first_moving(fil):
+    """Index of the first state that changes at every step; those before it are errors of sensors and model."""
+    return fil.at[ACCELERATION] if fil.at[ACCELERATION] >= 0 else fil.at[SPEED]
 
-    `sign` is the direction in which an unsigned odometer counts, `pull` is g sin(grade), `rough` the
-    sigma of the force; the variances slip, shake, step and tag
-    forget the wheel distance, shake the speed, and let the GNSS error and its time stamps jump; over `travel` metres the model's error
-    across changes, and `stretch` is the variance of what the model's length is wrong by there. Gives the number of noise columns.
-    """
-    # x (n,), F (n, n), Q (NOISES, n) one noise column a row, lead (NOISES,), new (n,)
+
+@inlined
+def drift(fil, x, dt, step, tag, travel, F, Q, lead, new):
+    """Fill in how errors of sensors and model change over some seconds: Gauss-Markov parts fade, biases walk. Gives the noise columns."""
     at = fil.at
     k = fil.settings
     n = x.shape[0]
-    for i in range(n):
-        new[i] = x[i]
-        for j in range(n):
-            F[i, j] = 0.0
-        F[i, i] = 1.0
-    i_ge, i_v, i_s = at[GNSS_EAST], at[SPEED], at[POSITION]
+    i_ge = at[GNSS_EAST]
     phi = math.exp(-dt / k[K_GNSS_TIME])
     F[i_ge, i_ge] = phi
     F[i_ge + 1, i_ge + 1] = phi
@@ -100,45 +94,6 @@ def transition(fil, x, dt, sign, force, rough, pull, slip, shake, step, tag, tra
             Q[c, i_l] = k[K_SPEED_LATENCY] * math.sqrt(1.0 - back * back)
             lead[c] = i_l
             c += 1
-    v = x[i_v]
-    F[i_s, i_v] = dt
-    i_a = at[ACCELERATION]
-    i_f = i_a
-    accelerometer = i_a < 0 and force == force
-    if i_a >= 0:  # Gauss-Markov acceleration
-        ta = k[K_ACC_TIME]
-        p = math.exp(-dt / ta)
-        gain_v = ta * (1.0 - p)
-        gain_s = ta * (dt - gain_v)
-        F[i_a, i_a] = p
-        F[i_v, i_a] = gain_v
-        F[i_s, i_a] = gain_s
-        new[i_a] = p * x[i_a]
-        dv = gain_v * x[i_a]
-        ds = v * dt + gain_s * x[i_a]
-    elif accelerometer:  # a = f - b - g sin(alpha)
-        i_f = at[ACCELEROMETER_BIAS]
-        a = force - x[i_f] - pull
-        F[i_v, i_f] = -dt
-        F[i_s, i_f] = -0.5 * dt * dt
-        dv = a * dt
-        ds = v * dt + 0.5 * dt * a * dt
-    else:
-        dv = 0.0
-        ds = v * dt
-    new[i_v] = v + dv
-    new[i_s] = x[i_s] + ds
-    i_d = at[WHEEL_DISTANCE]
-    rate = 0.0
-    if i_d >= 0:
-        i_k = at[ODOMETER_SCALE]
-        rate = sign * (1.0 + x[i_k])
-        new[i_d] = x[i_d] + rate * ds
-        F[i_d, i_k] = sign * ds
-        F[i_d, i_v] = rate * dt
-        if i_f >= 0:
-            F[i_d, i_f] = rate * F[i_s, i_f]
-    # noise columns
     for i in range(2):
         for j in range(n):
             Q[c, j] = 0.0
@@ -179,6 +134,75 @@ def transition(fil, x, dt, sign, force, rough, pull, slip, shake, step, tag, tra
             Q[c, i] = walk * root
             lead[c] = i
             c += 1
+    return c
+
+
+@inlined
+def transition(fil, x, dt, sign, force, rough, pull, slip, shake, step, tag, travel, stretch, slow, F, Q, lead, new):
+    """Fill the transition matrix F (lower triangular), the noise columns Q with their first rows and the predicted state (19.2).
+
+    `sign` is the direction in which an unsigned odometer counts, `pull` is g sin(grade), `rough` the
+    sigma of the force; the variances slip, shake, step and tag
+    forget the wheel distance, shake the speed, and let the GNSS error and its time stamps jump; over `travel` metres the model's error
+    across changes, and `stretch` is the variance of what the model's length is wrong by there. Errors of sensors and model, which
+    change slowly, do so for `slow` seconds in this step, 0 in most: place and speed do not depend on them between two fixes. F must be
+    zero beside what is set here. Gives the number of noise columns.
+    """
+    # x (n,), F (n, n), Q (NOISES, n) one noise column a row, lead (NOISES,), new (n,)
+    at = fil.at
+    k = fil.settings
+    n = x.shape[0]
+    i_v, i_s = at[SPEED], at[POSITION]
+    moving = first_moving(fil)
+    for i in range(n):
+        new[i] = x[i]
+        if slow > 0.0 or i >= moving:
+            for j in range(n):
+                F[i, j] = 0.0
+        F[i, i] = 1.0
+    c = 0
+    if slow > 0.0:
+        c = drift(fil, x, slow, step, tag, travel, F, Q, lead, new)
+    v = x[i_v]
+    F[i_s, i_v] = dt
+    i_a = at[ACCELERATION]
+    i_f = i_a
+    accelerometer = i_a < 0 and force == force
+    if i_a >= 0:  # Gauss-Markov acceleration
+        ta = k[K_ACC_TIME]
+        p = math.exp(-dt / ta)
+        gain_v = ta * (1.0 - p)
+        gain_s = ta * (dt - gain_v)
+        F[i_a, i_a] = p
+        F[i_v, i_a] = gain_v
+        F[i_s, i_a] = gain_s
+        new[i_a] = p * x[i_a]
+        dv = gain_v * x[i_a]
+        ds = v * dt + gain_s * x[i_a]
+    elif accelerometer:  # a = f - b - g sin(alpha)
+        i_f = at[ACCELEROMETER_BIAS]
+        a = force - x[i_f] - pull
+        F[i_v, i_f] = -dt
+        F[i_s, i_f] = -0.5 * dt * dt
+        dv = a * dt
+        ds = v * dt + 0.5 * dt * a * dt
+    else:
+        dv = 0.0
+        ds = v * dt
+    new[i_v] = v + dv
+    new[i_s] = x[i_s] + ds
+    i_d = at[WHEEL_DISTANCE]
+    rate = 0.0
+    if i_d >= 0:
+        i_k = at[ODOMETER_SCALE]
+        rate = sign * (1.0 + x[i_k])
+        new[i_d] = x[i_d] + rate * ds
+        F[i_d, i_k] = sign * ds
+        F[i_d, i_v] = rate * dt
+        if i_f >= 0:
+            F[i_d, i_f] = rate * F[i_s, i_f]
+    # noise columns
+    root = math.sqrt(dt)
     if i_a >= 0:  # white jerk, integrated three times (Cholesky root of its covariance)
         q = k[K_ACC_SIGMA] * math.sqrt(2.0 / k[K_ACC_TIME]) * root
         for m in range(3):
@@ -240,11 +264,14 @@ def transition(fil, x, dt, sign, force, rough, pull, slip, shake, step, tag, tra
     return c
 
 
-@part
-def predict(x, P_sqrt, F, Q, lead, columns, new):
-    """Carry a state and its lower-triangular covariance root over one step: F is lower triangular, noise columns are rotated in."""
+@inlined
+def predict(x, P_sqrt, F, Q, lead, columns, new, begin):
+    """Carry a state and its lower-triangular covariance root over one step: F is lower triangular, noise columns are rotated in.
+
+    Before the state `begin` F is the unit matrix.
+    """
     n = x.shape[0]
-    for i in range(n - 1, -1, -1):
+    for i in range(n - 1, begin - 1, -1):
         x[i] = new[i]
         diagonal = F[i, i]
         for j in range(i + 1):
@@ -267,7 +294,7 @@ def widen(P_sqrt, index, sigma, column):  # (n, n), state index, its unit, (n,) 
     add_column(P_sqrt, column, index)
 
 
-@part
+@inlined
 def variance_of(P_sqrt, index):
     """Variance of one state."""
     p = 0.0
@@ -292,15 +319,32 @@ def project(P_sqrt, h, f):  # (n, n) lower, (n,), (n,) out: f = P_sqrt^T h
     return s
 
 
+@inlined
+def known_without(
+    P_sqrt, f, index, h
+):  # f = P_sqrt^T of a row, its entry h at `index` -> the square without that entry
+    """What h P h^T would be if a row did not depend on one state."""
+    s = 0.0
+    for j in range(f.shape[0]):
+        d = f[j] - h * P_sqrt[index, j] if j <= index else f[j]
+        s += d * d
+    return s
+
+
 @part
 def absorb(x, P_sqrt, f, innovation, variance, keep, move):
     """Let one scalar row in, given its projection f (Carlson's rotations, lower-triangular form)."""
     n = x.shape[0]
     s = variance
     for j in range(n - 1, -1, -1):
+        if f[j] == 0.0:
+            keep[j] = 1.0
+            move[j] = 0.0
+            continue
         grown = s + f[j] * f[j]
-        keep[j] = math.sqrt(s / grown)
-        move[j] = f[j] / math.sqrt(s * grown)
+        inverse = 1.0 / math.sqrt(s * grown)
+        keep[j] = s * inverse
+        move[j] = f[j] * inverse
         s = grown
     gain = innovation / s
     for i in range(n):
@@ -315,7 +359,13 @@ def absorb(x, P_sqrt, f, innovation, variance, keep, move):
 @part
 def robust_row(x, P_sqrt, h, innovation, variance, f, keep, move):
     """Let one scalar row in; beyond the gate its variance grows until it fits, and its evidence saturates. Gives ln p."""
-    s = project(P_sqrt, h, f) + variance
+    return absorb_robustly(x, P_sqrt, f, project(P_sqrt, h, f), innovation, variance, keep, move)
+
+
+@part
+def absorb_robustly(x, P_sqrt, f, known, innovation, variance, keep, move):
+    """As `robust_row`, the projection f and its square `known` given."""
+    s = known + variance
     nis = innovation * innovation / s
     evidence = -0.5 * (min(nis, ROW_GATE) + math.log(s))
     if nis > ROW_GATE:
@@ -324,7 +374,7 @@ def robust_row(x, P_sqrt, h, innovation, variance, f, keep, move):
     return evidence
 
 
-@part
+@inlined
 def stamps(fil, x, P_sqrt):  # -> shift of the stamps, its variance, age of the speed, its variance
     """What rows must not tell where nothing but the fixes tells the time."""
     i_t, i_l = fil.at[TIME_TAG], fil.at[SPEED_LATENCY]

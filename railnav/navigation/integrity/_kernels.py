@@ -38,6 +38,7 @@ from railnav.matching._kernels import (
     TURN_TRACK,
     TURNED,
     entering_end,
+    inlined,
     leaving_end,
     part,
     track_point,
@@ -102,7 +103,7 @@ from railnav.navigation.columns import (
 from railnav.navigation.dynamics._kernels import variance_of
 
 
-@part
+@inlined
 def keep_check(fil, bank, h, time, slipping):
     """Let dead reckoning by the wheel begin anew, once a minute; after a slip both beginnings are void."""
     at = fil.at
@@ -304,7 +305,7 @@ def log_sum(a, b):
     return top + math.log(math.exp(a - top) + math.exp(b - top))
 
 
-@part
+@inlined
 def weigh_positions(fil, bank, slot, h, said, since):
     """Evidence of positions for a hypothesis, whether the receiver is sound or astray: that comes and goes.
 
@@ -331,7 +332,7 @@ def weigh_positions(fil, bank, slot, h, said, since):
     return log_sum(info[FRAMED] + info[KNOWN_ODDS], info[ASTRAY])
 
 
-@part
+@inlined
 def separation_bound(fil, bank, h, time):
     """Bound by solution separation (22): how far the filter lies from dead reckoning that has used no fix for one to two minutes.
 
@@ -351,7 +352,7 @@ def separation_bound(fil, bank, h, time):
     return apart + fil.risk[2] * math.sqrt(variance)
 
 
-@part
+@inlined
 def residual_bound(fil, shared, bank, work, h):
     """Bound by solution separation from the fixes alone (22): how far they lie along from the estimate, and what they are worth.
 
@@ -391,7 +392,7 @@ def residual_bound(fil, shared, bank, work, h):
     return max(bound, tail_quantile(fil.risk[0] / framed) * abs(info[OFFSET_CROSS]) * share)
 
 
-@part
+@inlined
 def frame_off(info):
     """Probability, if the train is on a hypothesis' track, that the run's frame is off by far more than is known of it."""
     if info[FAULT_ODDS] == -np.inf:
@@ -417,14 +418,14 @@ def tail_quantile(risk):
     return max(k + 5e-4, 0.0)
 
 
-@part
+@inlined
 def watch_misfit(common, nis):
     """Follow the squared normalised innovation of fixes in the hypothesis that they fit best, per degree of freedom, over 20 fixes."""
     share = max(1.0 / MISFIT_FIXES, 1.0 / (1.0 + common[C_FIXES]))
     common[C_MISFIT] += share * (0.5 * nis - common[C_MISFIT])
 
 
-@part
+@inlined
 def understated(common):
     """By how much the sigmas of fixes are too small, as their innovations show beyond chance: 1 where they are not."""
     return math.sqrt(max(common[C_MISFIT] / MISFIT_USUAL, 1.0))

@@ -36,8 +36,10 @@ from railnav.matching._kernels import (
     SIGN,
     SLIP_SINCE,
     credit,
+    inlined,
     part,
     path_point,
+    path_shape,
 )
 from railnav.navigation.columns import (
     ACCELERATION,
@@ -153,6 +155,8 @@ from railnav.navigation.columns import (
 )
 from railnav.navigation.dynamics._kernels import (
     absorb,
+    absorb_robustly,
+    known_without,
     project,
     robust_row,
     stamps,
@@ -214,7 +218,7 @@ def antenna(point, lever, out):  # (POINT_SIZE,), (3,) -> out (4,): easting, nor
     out[3] = along * tn - aside * te
 
 
-@part
+@inlined
 def direction(fil, bank, h):
     """Which way an unsigned speed or distance counts: by the estimate where that is certain, else as the hypothesis has it."""
     if fil.signed == 1:
@@ -225,7 +229,7 @@ def direction(fil, bank, h):
     return float(bank.tags[h, SIGN])
 
 
-@part
+@inlined
 def ring_speed(ring, latest, time, distance):  # odometer readings, index after the last, s, m -> m/s, s
     """Mean wheel speed over the last `WHEEL_SPAN`, and the span it really covers; 0 when readings do not reach back so far."""
     for m in range(1, RING):
@@ -272,7 +276,7 @@ def contradicted(fil, shared, bank, h, time, wheel):
     return away if ahead > max(2.0 * abs(away), 2.0 * common[C_ALONG_SIGMA]) else 0.0
 
 
-@part
+@inlined
 def wheel_row(fil, shared, bank, work, h, row, leader):
     """Odometer distance: a slipping wheel is forgotten until it agrees with the speed again. Gives ln p, slip and shake variances.
 
@@ -413,7 +417,7 @@ def wheel_speed_row(fil, bank, work, h, row):
     return evidence
 
 
-@part
+@inlined
 def log_once(variance, shared_part, alike):
     """Log-determinant's share of a row whose variance holds a part that `alike` rows have in common: it counts once in them.
 
@@ -422,7 +426,7 @@ def log_once(variance, shared_part, alike):
     return math.log(variance - shared_part) + math.log(variance / (variance - shared_part)) / alike
 
 
-@part
+@inlined
 def somewhere(
     innovation, variance, counts, once
 ):  # (>= 5,) by Gauss-Hermite node -> -2 ln p of a mixture over the place
@@ -442,7 +446,7 @@ def somewhere(
     return counts * best - 2.0 * once * math.log(p)
 
 
-@part
+@inlined
 def inertial_rows(fil, net, shared, bank, work, h, row, dt):
     """Yaw rate and specific force to the right, linearised statistically over the position's spread (five-point Gauss-Hermite).
 
@@ -471,7 +475,7 @@ def inertial_rows(fil, net, shared, bank, work, h, row, dt):
     lean_square = 0.0
     roll = 0.0
     for m in range(5):
-        path_point(net, bank, h, middle + GAUSS_HERMITE_NODES[m] * sd, probe)
+        path_shape(net, bank, h, middle + GAUSS_HERMITE_NODES[m] * sd, probe)
         bend = yaw_rate_kernel(1.0, probe[P_CURVATURE], probe[P_GRADIENT], probe[P_GRADIENT_RATE], probe[P_CANT])
         tilted = probe[P_CANT] / (RAIL_CENTRE_DISTANCE * math.sqrt(1.0 + probe[P_GRADIENT] * probe[P_GRADIENT]))
         w = GAUSS_HERMITE_WEIGHTS[m]
@@ -513,16 +517,16 @@ def inertial_rows(fil, net, shared, bank, work, h, row, dt):
         h_row[i_g] = 1.0
         h_row[i_t] = v * roll
         innovation = row[YAW_RATE] - v * (mean + x[i_t] * roll) - x[i_g]
-        work.slot[h, S_YAW] = innovation * innovation / (project(P_sqrt, h_row, f) + variance)
-        # tracks side by side differ in curvature by less than a model is wrong: only a turnout's difference is evidence
-        h_row[i_s] = 0.0
-        doubt = project(P_sqrt, h_row, f) + variance - v * v * rest + (v * k[K_CURVATURE_DOUBT]) ** 2
-        h_row[i_s] = v * slope
-        for m in range(5):
-            work.mix[2, m] = innovation + v * (mean - work.mix[0, m])
-        said = counts * log_once(doubt, v * v * rough, alike) + somewhere(work.mix[2], doubt, counts, once)
-        credit(bank, h, BY_YAW, -0.5 * said)
-        robust_row(x, P_sqrt, h_row, innovation, variance, f, keep, move)
+        known = project(P_sqrt, h_row, f)
+        work.slot[h, S_YAW] = innovation * innovation / (known + variance)
+        if bank.live[0] > 1:
+            # tracks side by side differ in curvature by less than a model is wrong: only a turnout's difference is evidence
+            doubt = known_without(P_sqrt, f, i_s, v * slope) + variance - v * v * rest + (v * k[K_CURVATURE_DOUBT]) ** 2
+            for m in range(5):
+                work.mix[2, m] = innovation + v * (mean - work.mix[0, m])
+            said = counts * log_once(doubt, v * v * rough, alike) + somewhere(work.mix[2], doubt, counts, once)
+            credit(bank, h, BY_YAW, -0.5 * said)
+        absorb_robustly(x, P_sqrt, f, known, innovation, variance, keep, move)
         h_row[i_g] = 0.0
         h_row[i_t] = 0.0
     if row[SIDE] == row[SIDE] and fil.canted == 1:
@@ -537,15 +541,15 @@ def inertial_rows(fil, net, shared, bank, work, h, row, dt):
         h_row[i_v] = 2.0 * v * mean
         h_row[i_y] = 1.0
         innovation = row[SIDE] - said - x[i_y]
-        h_row[i_s] = 0.0
-        doubt = project(P_sqrt, h_row, f) + variance + (v * v * k[K_CURVATURE_DOUBT]) ** 2
-        doubt -= v**4 * rest + k[K_GRAVITY] ** 2 * lean_rest
-        h_row[i_s] = v * v * slope - k[K_GRAVITY] * lean_slope
-        for m in range(5):
-            work.mix[2, m] = innovation + said - v * v * work.mix[0, m] + k[K_GRAVITY] * work.mix[1, m]
-        said = counts * log_once(doubt, v**4 * rough, alike) + somewhere(work.mix[2], doubt, counts, once)
-        credit(bank, h, BY_SIDE, -0.5 * said)
-        robust_row(x, P_sqrt, h_row, innovation, variance, f, keep, move)
+        known = project(P_sqrt, h_row, f)
+        if bank.live[0] > 1:
+            doubt = known_without(P_sqrt, f, i_s, h_row[i_s]) + variance + (v * v * k[K_CURVATURE_DOUBT]) ** 2
+            doubt -= v**4 * rest + k[K_GRAVITY] ** 2 * lean_rest
+            for m in range(5):
+                work.mix[2, m] = innovation + said - v * v * work.mix[0, m] + k[K_GRAVITY] * work.mix[1, m]
+            said = counts * log_once(doubt, v**4 * rough, alike) + somewhere(work.mix[2], doubt, counts, once)
+            credit(bank, h, BY_SIDE, -0.5 * said)
+        absorb_robustly(x, P_sqrt, f, known, innovation, variance, keep, move)
         h_row[i_y] = 0.0
     h_row[i_s] = 0.0
     h_row[i_v] = 0.0
@@ -651,7 +655,7 @@ def course_row(fil, shared, bank, work, h, row, sign, sigma):
     h_row[i_s] = 0.0
 
 
-@part
+@inlined
 def speed_rows(fil, shared, bank, work, h, row):
     """GNSS speed, |v - latency a| + error, and course, the velocity across the path as the antenna moves there."""
     at = fil.at
@@ -713,7 +717,7 @@ def speed_rows(fil, shared, bank, work, h, row):
         course_row(fil, shared, bank, work, h, row, sign, sigma)
 
 
-@part
+@inlined
 def motion_rows(fil, net, shared, bank, work, h, row, dt, still):
     """Odometer speed, standstill, yaw gyro, GNSS speed and course of one hypothesis, where they are there."""
     at = fil.at

@@ -22,6 +22,7 @@ from railnav.navigation.columns import (
     R_SHAKE,
     R_SIGN,
     R_SLIP,
+    R_SLOW,
     R_STEP,
     R_STRETCH,
     R_TAG,
@@ -92,7 +93,7 @@ def _compiled(stamp: int) -> Any:
             return
         n = x.shape[1]
         i_s, i_v = fil.at[POSITION], fil.at[SPEED]
-        F = np.empty((n, n))
+        F = np.zeros((n, n))
         Q = np.empty((NOISES, n))
         lead = np.empty(NOISES, np.int64)
         new = np.empty(n)
@@ -126,6 +127,7 @@ def _compiled(stamp: int) -> Any:
                     numbers[R_TAG],
                     numbers[R_TRAVEL],
                     numbers[R_STRETCH],
+                    numbers[R_SLOW],
                     F,
                     Q,
                     lead,

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from railnav.matching._kernels import BY_PATH, MOVED, SIGN, SLIP_SINCE, clone, credit, part
+from railnav.matching._kernels import BY_PATH, MOVED, SIGN, SLIP_SINCE, clone, credit, inlined, part
 from railnav.navigation.columns import (
     ACCELERATION,
     C_DISTRUST,
@@ -52,7 +52,7 @@ from railnav.navigation.columns import (
 from railnav.navigation.dynamics._kernels import variance_of, widen
 
 
-@part
+@inlined
 def watch(fil, shared, row):
     """Watch the receiver and the wheel: smoothed sigmas, repeated speeds, since when each is at rest."""
     common = shared.common
@@ -87,7 +87,7 @@ def watch(fil, shared, row):
         common[C_WHEEL_SEEN] = time
 
 
-@part
+@inlined
 def remember(shared, row):
     """Keep the latest odometer reading."""
     if row[DISTANCE] == row[DISTANCE]:
@@ -97,7 +97,7 @@ def remember(shared, row):
         shared.common[C_RING] = (r + 1) % RING
 
 
-@part
+@inlined
 def heaviest(bank):
     """Slot of the hypothesis with the greatest weight."""
     best = bank.live[1]
@@ -107,7 +107,7 @@ def heaviest(bank):
     return best
 
 
-@part
+@inlined
 def hold_repeated(fil, shared, bank, row):
     """Take out of a moving train's epoch the inertial means that repeat the ones before to the last digit: a frozen or saturated axis."""
     common = shared.common
@@ -121,7 +121,7 @@ def hold_repeated(fil, shared, bank, row):
             common[last] = value
 
 
-@part
+@inlined
 def stands(fil, shared, bank, row):
     """Whether the train is found to stand: wheels at rest and no GNSS speed against it; without wheels, GNSS speed at rest.
 
