@@ -87,7 +87,7 @@ def noise_of_smoothed(walk: float, offset: float, slope: float, curvature: float
     >>> q, r = 2e-9, 10.0
     >>> L = (r / q) ** (1.0 / 6.0)
     >>> one = noise_of_smoothed(q**0.5, (r / (3.0 * L)) ** 0.5, (r / (6.0 * L**3)) ** 0.5, (q * L / 3.0) ** 0.5)
-    >>> round(one.smoothing / L, 2), round(one.density / r, 1), one.correlated < 0.1
+    >>> round(one.smoothing / L, 2), round(one.density, 1), one.correlated < 0.1
     (1.0, 10.0, True)
     """
     q = walk**2
