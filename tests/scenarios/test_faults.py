@@ -118,6 +118,14 @@ def test_a_balise_read_under_another_name_moves_nothing(line, rides):
         assert np.abs(evaluation.along).max() < 10.0
 
 
+def test_a_dead_wheel_does_not_stop_a_train_that_still_rolls(line):
+    """The wheel's rest was taken for the train's at 0.7 m/s: 2 m at once, and 101 rows beyond the bound."""
+    run, truth = rn.simulate(
+        line, Leg(("77R-03",), start=200.0, finish=7000.0), seed=305, outfit=SERVICE, tunnels=False
+    )
+    keeps_the_pact(*judged(with_fault(run, "odometer-dead", start=ONSET, seed=305), truth, line))
+
+
 def test_unknown_faults_of_a_model_are_refused(line):
     with pytest.raises(InputError, match="no fault 'gremlins' of a model"):
         model_with_fault(line, "gremlins", "77R-03", start=0.0)
