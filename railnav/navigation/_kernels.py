@@ -102,6 +102,8 @@ from railnav.navigation.columns import (
     COAST_LONGEST,
     CONTRADICTS,
     CONTRADICTS_SHARE,
+    COURSE_MOST,
+    COURSE_TELLS,
     DISTANCE,
     DISTRUST,
     DONE,
@@ -477,16 +479,19 @@ def sense_all(fil, net, shared, bank, work, row, dt):
 
 @inlined
 def weigh_courses(bank, work):
-    """Evidence of courses counts with that of positions, and not at all if the receiver is astray or the track lies elsewhere."""
+    """Evidence of courses counts with that of positions, but what tells a turnout's leg from another does not fade: it is history."""
     top = -np.inf
     for i in range(bank.live[0]):
         top = max(top, work.slot[bank.live[1 + i], S_COURSE])
     for i in range(bank.live[0]):
         h = bank.live[1 + i]
         said = work.slot[h, S_COURSE] - top
-        bank.info[h, FRAMED] += said
-        bank.info[h, BY_COURSE] += said  # the fix, let in next, credits both together
-        bank.info[h, BY_POSITION] -= said
+        if said < -COURSE_TELLS:
+            credit(bank, h, BY_COURSE, max(said, -COURSE_MOST))
+        else:  # what a model's bearings may be wrong by fades as what fixes say does
+            bank.info[h, FRAMED] += said
+            bank.info[h, BY_COURSE] += said  # the fix, let in next, credits both together
+            bank.info[h, BY_POSITION] -= said
 
 
 @inlined

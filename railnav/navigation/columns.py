@@ -308,6 +308,9 @@ CHECK_INTERVAL = 60.0
 EVIDENCE_STEP = 1.0
 #: How much weaker the evidence of positions is when model or receiver are off by more than they say: sigmas five times as large.
 DOUBTED = 25.0
+#: What one course must tell between hypotheses to be that of a turnout's leg, nat, and the most that it can: receiver and model may both be
+#: wrong about a bearing.
+COURSE_TELLS, COURSE_MOST = 1.0, 4.0
 #: Length over which the error of a model's bearing is the same, m.
 BEARING_LENGTH = 20.0
 #: A slope of the curvature this many times its error counts.
