@@ -130,6 +130,7 @@ def main() -> None:
             f"median {np.median(np.abs(e)):.2f} m, 95 % {np.quantile(np.abs(e), 0.95):.1f} m",
             f"stated sigma {np.sqrt(np.mean(s**2)):.2f} m, within 2 sigma {np.mean(np.abs(e) < 2 * s):.1%}",
             f"within the bound {np.mean(within):.2%}; constant speed {np.sqrt(np.mean(n**2)):.2f} m RMS",
+            f"median {np.median(np.abs(n)):.2f} m, 95 % {np.quantile(np.abs(n), 0.95):.1f} m",
         ]
         print(", ".join(words))
 

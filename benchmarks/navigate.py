@@ -178,6 +178,20 @@ def real_line(folder: Path, quick: bool) -> dict[str, Any]:
         "fixes_per_s": round(fixes / seconds),
         "jumps": sum(r["jumps"] for r in rows),
         "snapped_jumps": sum(r["snapped_jumps"] for r in rows),
+        "receivers": {
+            kind: _claims([r for r in rows if r["run"].endswith(kind)]) for kind in ("iphone", "ublox", "mtk")
+        },
+    }
+
+
+def _claims(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """Share of rows on which a track is declared, and of these the share off the usual track of the train's direction."""
+    epochs = np.array([sum(r["modes"].values()) for r in rows], float)
+    declared = epochs * np.array([r["claimed_share"] for r in rows])
+    off = declared * (1.0 - np.nan_to_num(np.array([r["on_track_of_direction"] for r in rows]), nan=1.0))
+    return {
+        "declared_share": float(declared.sum() / max(epochs.sum(), 1.0)),
+        "off_usual_share": float(off.sum() / max(declared.sum(), 1.0)),
     }
 
 
@@ -224,6 +238,11 @@ def main(arguments: list[str] | None = None) -> int:
             f"  {r['run']}: {r['fixes']} fixes in {r['cpu_s']:.2f} s, claimed {r['claimed_share']:.2f}, of it on the track of its "
             f"direction {r['on_track_of_direction']:.2f}, jumps {r['jumps']} (nearest track {r['snapped_jumps']}), "
             f"revisions {r['revisions']}"
+        )
+    for kind, of in line["receivers"].items():
+        print(
+            f"  {kind}: a track is declared on {of['declared_share']:.1%} of rows, {of['off_usual_share']:.1%} of these off the usual track "
+            f"of the train's direction"
         )
     print(
         f"line80: {line['fixes']:,} fixes in {line['cpu_s']:.2f} s, {line['fixes_per_s']:,} fixes/s (bar: 100,000); jumps "
