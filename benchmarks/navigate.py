@@ -241,8 +241,8 @@ def main(arguments: list[str] | None = None) -> int:
         )
     for kind, of in line["receivers"].items():
         print(
-            f"  {kind}: a track is declared on {of['declared_share']:.1%} of rows, {of['off_usual_share']:.1%} of these off the usual track "
-            f"of the train's direction"
+            f"  {kind}: a track is declared on {of['declared_share']:.1%} of rows, {of['off_usual_share']:.1%} of these off the usual "
+            f"track of the direction"
         )
     print(
         f"line80: {line['fixes']:,} fixes in {line['cpu_s']:.2f} s, {line['fixes_per_s']:,} fixes/s (bar: 100,000); jumps "
