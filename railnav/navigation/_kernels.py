@@ -222,6 +222,7 @@ from railnav.navigation.measurements._kernels import (
     position_row,
     wheel_row,
 )
+from railnav.navigation.shape import EXACT
 from railnav.navigation.standing import _kernels as standing
 from railnav.navigation.standing._kernels import depart, heaviest, hold_repeated, kick, remember, stands, watch
 
@@ -479,14 +480,21 @@ def sense_all(fil, net, shared, bank, work, row, dt):
 
 @inlined
 def weigh_courses(bank, work):
-    """Evidence of courses counts with that of positions, but what tells a turnout's leg from another does not fade: it is history."""
+    """Evidence of courses counts with that of positions, but what tells a turnout's leg from another does not fade: it is history.
+
+    That holds on models that state bearings to be known. On one that is decimetres off, or does not say, every bend of its error would
+    tell tracks side by side apart, again and again, and for good.
+    """
     top = -np.inf
+    known = True
     for i in range(bank.live[0]):
-        top = max(top, work.slot[bank.live[1 + i], S_COURSE])
+        h = bank.live[1 + i]
+        top = max(top, work.slot[h, S_COURSE])
+        known = known and 0.0 < work.point[h, P_SIGMA_CROSS] <= EXACT
     for i in range(bank.live[0]):
         h = bank.live[1 + i]
         said = work.slot[h, S_COURSE] - top
-        if said < -COURSE_TELLS:
+        if known and said < -COURSE_TELLS:
             credit(bank, h, BY_COURSE, max(said, -COURSE_MOST))
         else:  # what a model's bearings may be wrong by fades as what fixes say does
             bank.info[h, FRAMED] += said

@@ -160,7 +160,7 @@ class Settings:
         How the constant part of the error across the track wanders, m/sqrt(s).
     track_missing : float
         Probability that a train starts on a track that the model lacks, beside one that it has. No track is declared before that is
-        unlikely.
+        unlikely. 0.1 would leave nothing declared on a line that is known to a metre or two, where fixes cannot rule that track out.
     astray_rate, astray_walk, astray_time : float
         How often a receiver goes astray, or comes to a stretch where the track lies elsewhere than the model has it, 1/s; how its
         error across the track then wanders, m/sqrt(s), and how long that lasts on average, s.
@@ -263,7 +263,7 @@ class Settings:
     frame_fault: float = 0.015
     frame_fault_sigma: float = 8.0
     frame_walk: float = 0.03
-    track_missing: float = 0.1
+    track_missing: float = 0.03
     astray_rate: float = 1e-3
     astray_walk: float = 1.2
     astray_time: float = 20.0
