@@ -93,9 +93,9 @@ PAGES = {
                 "alignment",
                 "Elements of alignments",
                 "Simulated noise on sampled designs. A curve of R = 600 m and L = 80 m over seeds; a made-up line of 31 km; two main "
-                "tracks of SBB and the trams of Mannheim, each metre with 5 mm, against their own element tables. A joint counts as one "
-                "that such points can show if its change moves the shorter neighbour by over four sigmas of its mean.",
-                "python benchmarks/alignment.py",
+                "tracks of SBB and trams of Mannheim, as many of its axes in random order as the minutes allow, each metre with 5 mm, "
+                "against their own element tables. A joint counts as one that such points can show if its change moves the shorter neighbour by over four sigmas of its mean.",
+                "python benchmarks/alignment.py --seeds 50 --minutes 3",
                 real_data=True,
             ),
             Section(
@@ -110,7 +110,7 @@ PAGES = {
                 "Simulated, on the bundled line, each case with its bar. The open-sky bar comes from a filter that "
                 "is told the noise (white 1.5 m), and so is the navigator in the first row; untold, it assumes coloured errors, as "
                 "receivers have them, and is shown on both.",
-                "python benchmarks/monte_carlo.py --scale 0.2",
+                "python benchmarks/monte_carlo.py --scale 0.4",
             ),
             Section(
                 "protection-level",
