@@ -94,7 +94,8 @@ PAGES = {
                 "Elements of alignments",
                 "Simulated noise on sampled designs. A curve of R = 600 m and L = 80 m over seeds; a made-up line of 31 km; two main "
                 "tracks of SBB and trams of Mannheim, as many of its axes in random order as the minutes allow, each metre with 5 mm, "
-                "against their own element tables. A joint counts as one that such points can show if its change moves the shorter neighbour by over four sigmas of its mean.",
+                "against their own element tables. A joint counts "
+                "as one that such points can show if its change moves the shorter neighbour by over four sigmas of its mean.",
                 "python benchmarks/alignment.py --seeds 50 --minutes 3",
                 real_data=True,
             ),
