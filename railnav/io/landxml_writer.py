@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ import numpy as np
 
 from railnav.errors import InputError
 from railnav.io.atomic import atomic_path
-from railnav.io.design import ARC, BLOSS, CLOTHOID, COSINE, CUBIC, HELMERT, SINE, STRAIGHT, VIENNESE, integrate
+from railnav.io.design import ARC, BLOSS, CLOTHOID, COSINE, CUBIC, HELMERT, SINE, STRAIGHT, VIENNESE, Plan, integrate
 from railnav.io.designed import DesignedAlignment, designed_tracks
 from railnav.track.model import TrackModel
 
@@ -62,10 +63,12 @@ def write_landxml(
     Raises
     ------
     InputError
-        No alignments, one without elements, a name twice, a transition that bends both ways, or a file that cannot be written.
+        No alignments, one without elements, a name twice, a transition other than a clothoid that bends both ways, or a file that
+        cannot be written.
 
     Notes
     -----
+    A clothoid that bends both ways becomes two, which meet where it is straight: LandXML has one sense of turning for each.
     Coordinates have 7 decimals and curvature all digits. A model read back lies within 1 mm, its stations within 10 mm of its
     posts. Nodes, movements, covariance and provenance have no place in LandXML: junctions follow from the ends when it is read.
     Where stations count in ground metres, or kilometres are stretched, they fit at the posts and drift between them.
@@ -95,6 +98,7 @@ def write_landxml(
     if not alignments:
         raise InputError("there are no alignments to write", file=path)
     seen: set[str] = set()
+    alignments = [replace(alignment, plan=_bent_one_way(alignment.plan)) for alignment in alignments]
     for alignment in alignments:
         if alignment.name in seen:
             raise InputError(f"alignment {alignment.name!r} stands twice", file=path, remedy="name each of them")
@@ -103,13 +107,36 @@ def write_landxml(
             raise InputError(f"alignment {alignment.name!r} has no elements", file=path)
         both = (alignment.plan.curvature_start * alignment.plan.curvature_end < 0.0).nonzero()[0]
         if len(both):
-            cause = f"alignment {alignment.name!r}, element {int(both[0]) + 1}: a transition that bends both ways"
+            law = SPIRALS.get(int(alignment.plan.kind[both[0]]), "element")
+            cause = f"alignment {alignment.name!r}, element {int(both[0]) + 1}: a {law} that bends both ways"
             raise InputError(
-                cause, file=path, remedy="split it at its point of inflection: LandXML has one rot for each"
+                cause, file=path, remedy="LandXML has one rot for each, and only clothoids can be split: use clothoids"
             )
     with atomic_path(path) as draft, draft.open("w", encoding="utf-8", newline="\n") as file:
         for line in _document(alignments, crs_wkt, project or path.stem):
             file.write(line + "\n")
+
+
+def _bent_one_way(plan: Plan) -> Plan:
+    """Return the plan with every clothoid that bends both ways cut in two at its point of inflection; the axis stays what it is."""
+    first, last = plan.curvature_start, plan.curvature_end
+    both = np.flatnonzero((first * last < 0.0) & (plan.kind == CLOTHOID))
+    if not len(both):
+        return plan
+    share = first[both] / (first[both] - last[both])
+    points, bearing = integrate(plan, plan.edges[both] + share * plan.length[both])
+    length, curvature_end = plan.length.copy(), last.copy()
+    length[both], curvature_end[both] = share * plan.length[both], 0.0
+    return Plan(
+        length=np.insert(length, both + 1, (1.0 - share) * plan.length[both]),
+        kind=np.insert(plan.kind, both + 1, CLOTHOID),
+        curvature_start=np.insert(first, both + 1, 0.0),
+        curvature_end=np.insert(curvature_end, both + 1, last[both]),
+        easting=np.insert(plan.easting, both + 1, points[:, 0]),
+        northing=np.insert(plan.northing, both + 1, points[:, 1]),
+        grid_bearing=np.insert(plan.grid_bearing, both + 1, bearing),
+        sway=np.insert(plan.sway, both + 1, 0.0),
+    )
 
 
 def _document(alignments: Sequence[DesignedAlignment], crs_wkt: str, project: str) -> Iterator[str]:

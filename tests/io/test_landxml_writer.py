@@ -155,8 +155,22 @@ def test_a_track_without_chainage_comes_back_without(tmp_path):
     assert math.isnan(float(model.at("T", 10.0).height))
 
 
+def test_a_clothoid_that_bends_both_ways_becomes_two(tmp_path):
+    plan = chained([(50.0, ARC, -1e-3, -1e-3), (120.0, CLOTHOID, -1e-3, 2e-3), (60.0, ARC, 2e-3, 2e-3)])
+    write_landxml([DesignedAlignment("T", plan)], tmp_path / "t.xml")
+    text = (tmp_path / "t.xml").read_text()
+    assert text.count('spiType="clothoid"') == 2
+    assert 'length="40" radiusStart="1000" radiusEnd="INF"' in text
+    assert 'length="80" radiusStart="INF" radiusEnd="500"' in text
+    model = read_landxml(tmp_path / "t.xml", crs=CRS)
+    assert model.provenance["import"]["largest_gap_m"] < 2e-6
+    at, _ = integrate(plan, np.array([0.0, 70.0, 110.0, 230.0]))
+    for easting, northing in at:
+        assert min(abs(foot.cross) for foot in model.locate(easting, northing)) < 1e-4
+
+
 def test_what_cannot_be_written(tmp_path):
-    plan = chained([(100.0, CLOTHOID, -1e-3, 1e-3)])
+    plan = chained([(100.0, BLOSS, -1e-3, 1e-3)])
     with pytest.raises(InputError, match="bends both ways"):
         write_landxml([DesignedAlignment("T", plan)], tmp_path / "t.xml")
     good = DesignedAlignment("T", chained([(100.0, STRAIGHT, 0.0, 0.0)]))

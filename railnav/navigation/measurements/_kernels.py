@@ -165,6 +165,7 @@ from railnav.navigation.dynamics._kernels import (
     variance_of,
     widen,
 )
+from railnav.navigation.shape import EXACT
 from railnav.units import RAIL_CENTRE_DISTANCE
 
 
@@ -640,12 +641,17 @@ def course_row(fil, shared, bank, work, h, row, sign, sigma):
     h_row[i_t] = h_row[i_s] * x[i_v]
     # an error of the model's bearing is the same from fix to fix of a slow train
     turned = speed * fil.turned * point[P_SIGMA_CROSS]
-    alike = max(1.0, BEARING_LENGTH / max(speed * (row[TIME] - shared.common[C_FIX_TIME]), 0.1))
+    since = max(speed * (row[TIME] - shared.common[C_FIX_TIME]), 0.1)
+    alike = max(1.0, BEARING_LENGTH / since)
     variance = sigma * sigma + floor * floor + bent * bent + alike * turned * turned
     # tracks side by side differ in bearing by less than a model is wrong: only a turnout's leg is evidence
     doubt = k[K_COURSE_DOUBT] + fil.turned * point[P_SIGMA_CROSS]
     doubt = project(P_sqrt, h_row, f) + variance + (speed * doubt) ** 2
     said = min(across * across / doubt, ROW_GATE) + log_once(doubt, alike * turned * turned, alike)
+    if (
+        point[P_SIGMA_CROSS] > EXACT
+    ):  # a map's bends are wrong over the length of its errors: many fixes see one and the same
+        said /= max(1.0, BLIND_LENGTH / since)
     work.slot[h, S_COURSE] -= 0.5 * said
     before = stamps(fil, x, P_sqrt)
     robust_row(x, P_sqrt, h_row, across, variance, f, keep, move)
