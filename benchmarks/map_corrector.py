@@ -2,7 +2,7 @@
 
 Run `python benchmarks/map_corrector.py [--trials 40] [--json PATH]`. A near-circular road of 1.2 km with hills, 9 to 15 m/s; IMU at 10 Hz
 with the white noise of L3G4200D and LSM303DLH and no systematic errors (unless said), GNSS at 1 Hz with 3 m in each axis; map of points
-1 m apart. Root mean square over each run of 300 s; bars of the issue: 3 m, 0.23 m/s, 30 arc minutes.
+1 m apart. Root mean square over each run of 300 s; bars: 3 m, 0.23 m/s, 30 arc minutes.
 """
 
 from __future__ import annotations

@@ -355,7 +355,7 @@ def level(line: TrackModel, scale: float) -> dict[str, Any]:
         held = verdict(binomial_bounds(over, epochs)[0] <= risk)
         print(
             f"protection level at {risk:g}: exceeded {share(over, epochs)} independent epochs (bar: no more than promised, within the "
-            f"interval: {held}; as many epochs as the issue asks for: benchmarks/protection_level.py)"
+            f"interval: {held}; as many epochs as are asked for: benchmarks/protection_level.py)"
         )
         found[f"{risk:g}"] = {"exceeded": over, "epochs": epochs}
     return found

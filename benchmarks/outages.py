@@ -46,7 +46,7 @@ CAR = {"axle_arm": 1.0, "mounting": 2.0 * DEGREE}
 STEP, SLIDE, POSITION, VELOCITY = 0.1, 0.2, 0.03, 0.1
 #: Cut, period, s.
 CUTS = ((15.0, 45.0), (30.0, 60.0), (60.0, 120.0))
-#: Bars of the issue for the first of them, m.
+#: Bars for the first of them, m.
 BARS = {"causal": 6.3, "causal, wheels": 4.8, "smoothed, wheels": 0.44}
 
 

@@ -22,7 +22,7 @@ from railnav.inertial.imu_noise import ImuNoise, InitialSigma
 from railnav.inertial.mechanization import GravityField, NavigationState, mechanize
 
 SCHEMES = ("coning", "matrix", "euler", "predictor", "predictor_first_order")
-#: Bar of the issue, samples/s.
+#: Bar, samples/s.
 BAR = 2e6
 #: Bars of the square-root filter by its states, samples/s with the covariance carried at each.
 FILTER_BARS = {15: 160e3, 21: 70e3}

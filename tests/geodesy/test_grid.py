@@ -243,7 +243,7 @@ def test_round_trip_anywhere_in_a_zone(latitude, offset, height):
 
 @pytest.mark.parametrize("name", ["wgs84 gk6", "pulkovo", "db_ref", "lv95", "omerc", "local"])
 def test_ground_length_against_ecef(name):
-    """0.05 ppm for 1 m to 5 km, 210 km off the meridian, heights to 800 m, slopes to 3 %: the issue's figure.
+    """0.05 ppm for 1 m to 5 km, 210 km off the meridian, heights to 800 m, slopes to 3 %: the figure asked for.
 
     Outside truth: the segment is cut into 64 pieces, each taken to WGS 84 and measured as an ECEF chord.
     """
