@@ -111,7 +111,7 @@ PAGES = {
                 "Simulated, on the bundled line, each case with its bar. The open-sky bar comes from a filter that "
                 "is told the noise (white 1.5 m), and so is the navigator in the first row; untold, it assumes coloured errors, as "
                 "receivers have them, and is shown on both.",
-                "python benchmarks/monte_carlo.py --scale 0.6",
+                "python benchmarks/monte_carlo.py",
             ),
             Section(
                 "protection-level",
