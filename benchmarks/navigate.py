@@ -230,7 +230,7 @@ def main(arguments: list[str] | None = None) -> int:
     step = figures["sample_run"]["live"]
     print(
         f"live step: CPU p50 {step['cpu']['p50_us']:.0f}, p99 {step['cpu']['p99_us']:.0f} us; "
-        f"wall p50 {step['wall']['p50_us']:.0f}, p99 {step['wall']['p99_us']:.0f} us (bar: p99 200 us)"
+        f"wall p50 {step['wall']['p50_us']:.0f}, p99 {step['wall']['p99_us']:.0f} us (bar: p99 100 us)"
     )
     line = figures["line80"]
     for r in line["runs"]:
