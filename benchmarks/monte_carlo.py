@@ -354,8 +354,8 @@ def level(line: TrackModel, scale: float) -> dict[str, Any]:
             epochs += len(known)
         held = verdict(binomial_bounds(over, epochs)[0] <= risk)
         print(
-            f"protection level at {risk:g}: exceeded {share(over, epochs)} independent epochs (bar: no more than promised, within the "
-            f"interval: {held}; as many epochs as are asked for: benchmarks/protection_level.py)"
+            f"protection level at {risk:g}: exceeded {share(over, epochs)} epochs 100 s apart, not quite independent (bar: no more than "
+            f"promised, within the interval: {held}; independent ones: benchmarks/protection_level.py)"
         )
         found[f"{risk:g}"] = {"exceeded": over, "epochs": epochs}
     return found

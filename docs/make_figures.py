@@ -109,8 +109,8 @@ PAGES = {
                 "monte-carlo",
                 "What the navigator promises, by seeded Monte Carlo",
                 "Simulated, on the bundled line, each case with its bar. The open-sky bar comes from a filter that "
-                "is told the noise (white 1.5 m), and so is the navigator in the first row; untold, it assumes coloured errors, as "
-                "receivers have them, and is shown on both.",
+                "is told the noise, and so is the navigator where the sensors are declared in run.toml; else it assumes coloured errors, "
+                "as receivers have them, and is shown on both.",
                 "python benchmarks/monte_carlo.py",
             ),
             Section(
