@@ -96,7 +96,7 @@ PAGES = {
                 "tracks of SBB and trams of Mannheim, as many of its axes in random order as the minutes allow, each metre with 5 mm, "
                 "against their own element tables. A joint counts "
                 "as one that such points can show if its change moves the shorter neighbour by over four sigmas of its mean.",
-                "python benchmarks/alignment.py --seeds 50 --minutes 3",
+                "python benchmarks/alignment.py --seeds 40 --minutes 2",
                 real_data=True,
             ),
             Section(
